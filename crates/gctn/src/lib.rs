@@ -1,0 +1,1 @@
+//! Goal-Conditioned Transporter Networks in libtorch: networks, losses, augmentation, checkpoints.

@@ -1,0 +1,1 @@
+//! MultiRavens on Rapier: simulated work cell, rendering, task modules, problems, demonstrators.

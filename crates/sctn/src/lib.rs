@@ -1,0 +1,1 @@
+//! Sequence-conditioned learning: data set, weighted sampling, training, evaluation.

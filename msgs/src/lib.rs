@@ -1,0 +1,1 @@
+//! Rust types made at build time from the ROS interface files, and checked conversions to library types.

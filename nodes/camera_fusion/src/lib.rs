@@ -1,0 +1,1 @@
+//! Node that fuses camera views into heightmaps.

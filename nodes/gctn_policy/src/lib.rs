@@ -1,0 +1,1 @@
+//! Node that proposes pick and place poses.

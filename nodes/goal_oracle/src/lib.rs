@@ -1,0 +1,1 @@
+//! Node that holds the demonstration sequence and latches the next-step goal.

@@ -1,0 +1,1 @@
+//! What ros2-client leaves to us: context, ROS arguments, parameters, QoS profiles, spinning.

@@ -1,0 +1,3 @@
+//! The sctn command.
+
+fn main() {}

@@ -1,0 +1,1 @@
+//! Node that executes approved proposals through the UR driver interface.

@@ -1,0 +1,3 @@
+//! Set-up, demonstration run and tests of the whole repository.
+
+fn main() {}

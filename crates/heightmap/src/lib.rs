@@ -1,1 +1,14 @@
 //! Workspace and pixel conventions, camera model, and fusion of RGB-D views into a heightmap.
+//!
+//! Frames: `world` is the robot base frame of REP-103 (x forward, y left, z up, metres). A camera's
+//! optical frame has x right, y down, z forward. Heightmap rows run along +y, columns along +x; cell
+//! (0, 0) lies at the corner of the smallest x and y.
+
+mod camera;
+mod fusion;
+mod picture;
+mod workspace;
+
+pub use camera::{Camera, CameraError, Intrinsics};
+pub use fusion::{Fusion, FusionError, FusionReport, View};
+pub use workspace::{Heightmap, HeightmapError, Pixel, Workspace};

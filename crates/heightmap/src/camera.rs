@@ -1,0 +1,168 @@
+//! Pinhole camera model.
+
+use nalgebra::{Isometry3, Point2, Point3, Translation3, UnitQuaternion, Vector3};
+use serde::{Deserialize, Serialize};
+
+/// Pinhole intrinsics, without distortion. Image point (u, v) runs right and down; pixel centres have
+/// whole coordinates, as in ROS.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Intrinsics {
+    /// Image width.
+    pub width: usize,
+    /// Image height.
+    pub height: usize,
+    /// Focal length along x.
+    pub fx_px: f64,
+    /// Focal length along y.
+    pub fy_px: f64,
+    /// Principal point, x.
+    pub cx_px: f64,
+    /// Principal point, y.
+    pub cy_px: f64,
+}
+
+impl Intrinsics {
+    /// The cameras of Ravens.
+    pub const RAVENS: Self = Self {
+        width: 640,
+        height: 480,
+        fx_px: 450.0,
+        fy_px: 450.0,
+        cx_px: 320.0,
+        cy_px: 240.0,
+    };
+
+    /// Number of pixels.
+    pub const fn len(&self) -> usize {
+        self.width * self.height
+    }
+
+    /// The ray through an image point, in the optical frame: 1 long along the optical axis.
+    pub fn ray(&self, image: &Point2<f64>) -> Vector3<f64> {
+        Vector3::new(
+            (image.x - self.cx_px) / self.fx_px,
+            (image.y - self.cy_px) / self.fy_px,
+            1.0,
+        )
+    }
+}
+
+/// A calibrated camera.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Camera {
+    /// Name of the camera, as in topics and frames.
+    pub name: String,
+    /// Intrinsics.
+    pub intrinsics: Intrinsics,
+    /// Pose of the optical frame (x right, y down, z forward) in the world.
+    pub world_from_camera: Isometry3<f64>,
+}
+
+/// A camera that cannot take pictures.
+#[derive(Debug, thiserror::Error, PartialEq)]
+pub enum CameraError {
+    /// An intrinsic parameter makes no sense.
+    #[error("camera {camera}: {what} is {actual}, expected {expected}")]
+    Intrinsics {
+        /// Name of the camera.
+        camera: String,
+        /// Which parameter.
+        what: &'static str,
+        /// Its value.
+        actual: f64,
+        /// What was expected.
+        expected: &'static str,
+    },
+    /// The pose has a part that is not finite.
+    #[error("camera {camera}: the pose in the world is not finite")]
+    Pose {
+        /// Name of the camera.
+        camera: String,
+    },
+}
+
+impl Camera {
+    /// Front, left and right camera of Ravens (Zeng et al., CoRL 2020), in the frame of the robot base.
+    pub fn ravens() -> [Self; 3] {
+        use std::f64::consts::PI;
+        let camera = |name: &str, position: [f64; 3], [roll, pitch, yaw]: [f64; 3]| Self {
+            name: name.into(),
+            intrinsics: Intrinsics::RAVENS,
+            world_from_camera: Isometry3::from_parts(
+                Translation3::from(position),
+                UnitQuaternion::from_euler_angles(roll, pitch, yaw),
+            ),
+        };
+        [
+            camera("front", [1.0, 0.0, 0.75], [PI / 4.0, PI, -PI / 2.0]),
+            camera("left", [0.0, 0.5, 0.75], [PI / 4.5, PI, PI / 4.0]),
+            camera("right", [0.0, -0.5, 0.75], [PI / 4.5, PI, 3.0 * PI / 4.0]),
+        ]
+    }
+
+    /// Checks that sizes, focal lengths, principal point and pose make sense.
+    pub fn check(&self) -> Result<(), CameraError> {
+        let Intrinsics {
+            width,
+            height,
+            fx_px,
+            fy_px,
+            cx_px,
+            cy_px,
+        } = self.intrinsics;
+        // 1 to 2^16: any real camera, and products that cannot overflow.
+        let size = |size: usize| (1..=1 << 16).contains(&size);
+        let focal = |length: f64| length.is_finite() && length > 0.0;
+        let checks = [
+            ("the width", width as f64, size(width), "1 to 65536"),
+            ("the height", height as f64, size(height), "1 to 65536"),
+            ("fx", fx_px, focal(fx_px), "a positive number"),
+            ("fy", fy_px, focal(fy_px), "a positive number"),
+            ("cx", cx_px, cx_px.is_finite(), "a finite number"),
+            ("cy", cy_px, cy_px.is_finite(), "a finite number"),
+        ];
+        for (what, actual, good, expected) in checks {
+            if !good {
+                return Err(CameraError::Intrinsics {
+                    camera: self.name.clone(),
+                    what,
+                    actual,
+                    expected,
+                });
+            }
+        }
+        let pose = &self.world_from_camera;
+        let translation = pose.translation.vector.iter();
+        let mut parts = translation.chain(pose.rotation.coords.iter());
+        if !parts.all(|part| part.is_finite()) {
+            return Err(CameraError::Pose {
+                camera: self.name.clone(),
+            });
+        }
+        Ok(())
+    }
+
+    /// The world point at an image point and a depth along the optical axis.
+    pub fn back_project(&self, image: &Point2<f64>, depth_m: f64) -> Point3<f64> {
+        self.world_from_camera * Point3::from(self.intrinsics.ray(image) * depth_m)
+    }
+
+    /// Image point and depth of a world point, if it is before the camera.
+    pub fn project(&self, point: &Point3<f64>) -> Option<(Point2<f64>, f64)> {
+        let point = self.world_from_camera.inverse_transform_point(point);
+        let Intrinsics {
+            fx_px,
+            fy_px,
+            cx_px,
+            cy_px,
+            ..
+        } = self.intrinsics;
+        (point.z > 0.0).then(|| {
+            let image = Point2::new(
+                fx_px * point.x / point.z + cx_px,
+                fy_px * point.y / point.z + cy_px,
+            );
+            (image, point.z)
+        })
+    }
+}

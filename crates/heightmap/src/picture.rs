@@ -1,0 +1,1 @@
+//! Pictures of heightmaps as PNG.

@@ -1,16 +1,17 @@
-//! Lets executables find libtorch where Cargo linked it from, with nothing exported.
-//!
-//! Link arguments reach only the package whose build script prints them. Every package with a program, a test or a
-//! benchmark that ends up with tch therefore names this file: `build = "../../crates/gctn/build.rs"`.
+//! Lets the tests, benches and examples of this package find libtorch where torch-sys found it, with
+//! nothing exported. Cargo hands link arguments only to the package that prints them, so every package
+//! that makes an executable with tch in it has a copy of this file and depends on torch-sys directly.
 
 fn main() {
     println!("cargo::rerun-if-changed=build.rs");
-    println!("cargo::rerun-if-env-changed=LIBTORCH");
-    // Programs in target/PROFILE, then tests and benchmarks in target/PROFILE/deps: holds when the tree is moved.
-    println!("cargo::rustc-link-arg=-Wl,-rpath,$ORIGIN/../../.libtorch/lib");
-    println!("cargo::rustc-link-arg=-Wl,-rpath,$ORIGIN/../../../.libtorch/lib");
-    // Any other target folder, or another libtorch.
-    if let Some(libtorch) = std::env::var_os("LIBTORCH") {
-        println!("cargo::rustc-link-arg=-Wl,-rpath,{}/lib", libtorch.to_string_lossy());
+    if let Ok(libraries) = std::env::var("DEP_TCH_LIBTORCH_LIB") {
+        println!("cargo::rustc-link-arg=-Wl,-rpath,{libraries}");
+    }
+    // A tree that was moved after the build: target/release and target/release/deps.
+    for origin in [
+        "$ORIGIN/../../.libtorch/lib",
+        "$ORIGIN/../../../.libtorch/lib",
+    ] {
+        println!("cargo::rustc-link-arg=-Wl,-rpath,{origin}");
     }
 }

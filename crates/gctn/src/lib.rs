@@ -1,1 +1,27 @@
 //! Goal-Conditioned Transporter Networks in libtorch: networks, losses, augmentation, checkpoints.
+//!
+//! The only crate that knows libtorch. A [`Policy`] turns two heightmaps, what is seen and what it should
+//! become, into a pick and a place pose in SE(2); a [`Trainer`] makes one from demonstrated steps.
+
+mod checkpoint;
+mod config;
+mod error;
+mod policy;
+mod sample;
+mod trainer;
+
+pub use checkpoint::{ModelCard, Storage};
+pub use config::{
+    Augmentation, Compact, Device, GoalConditioning, Interpolation, Network, NetworkConfig,
+    PlaceLoss, Precision, Resnet43, Schedule, TrainingConfig,
+};
+pub use error::Error;
+pub use policy::{Decision, Policy, ScoreMap};
+pub use sample::Sample;
+pub use trainer::{Losses, Trainer};
+
+/// Sets how many threads libtorch computes with, in the whole process. Sums are split by thread: another
+/// number gives other last bits.
+pub fn set_threads(threads: usize) {
+    tch::set_num_threads(threads.clamp(1, 1024) as i32);
+}

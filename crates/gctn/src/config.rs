@@ -1,0 +1,421 @@
+//! Configuration of networks and of training.
+
+use heightmap::Workspace;
+use serde::{Deserialize, Serialize};
+
+use crate::Error;
+
+/// A network and the grid it works on: what a checkpoint needs besides its weights.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct NetworkConfig {
+    /// Rows of the heightmaps (along +y).
+    #[serde(default = "rows")]
+    pub rows: usize,
+    /// Columns of the heightmaps (along +x).
+    #[serde(default = "cols")]
+    pub cols: usize,
+    /// Edge length of a cell of the heightmaps.
+    #[serde(default = "pixel_size_m")]
+    pub pixel_size_m: f64,
+    /// Number of place rotations, spread evenly over a full turn.
+    #[serde(default = "rotations")]
+    pub rotations: usize,
+    /// Which image of the demonstration the network is shown as its goal.
+    #[serde(default)]
+    pub conditioning: GoalConditioning,
+    /// The network.
+    pub network: Network,
+}
+
+fn rows() -> usize {
+    Workspace::RAVENS.rows
+}
+
+fn cols() -> usize {
+    Workspace::RAVENS.cols
+}
+
+fn pixel_size_m() -> f64 {
+    Workspace::RAVENS.pixel_size_m
+}
+
+fn rotations() -> usize {
+    36
+}
+
+/// Which image of the demonstration sequence is the goal (paper, section IV-A).
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum GoalConditioning {
+    /// The first observation with a delta reward after the present step (SCTN).
+    #[default]
+    NextStep,
+    /// The last observation of the demonstration (GCTN).
+    Final,
+}
+
+/// The networks to choose from.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(tag = "kind", rename_all = "snake_case")]
+pub enum Network {
+    /// Four ResNet43_8s nets as published: pick, query, key, goal.
+    Resnet43(Resnet43),
+    /// One shared U-Net with three small heads.
+    Compact(Compact),
+}
+
+/// The published Goal-Conditioned Transporter Network (Seita et al., ICRA 2021; paper, section III-B).
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Resnet43 {
+    /// Edge length of the query window round the pick. Even.
+    pub crop_px: usize,
+    /// Feature channels of the place nets.
+    pub feature_channels: usize,
+    /// How the query window is rotated.
+    pub rotation_sampling: Interpolation,
+}
+
+impl Default for Resnet43 {
+    fn default() -> Self {
+        Self {
+            crop_px: 64,
+            feature_channels: 3,
+            rotation_sampling: Interpolation::Nearest,
+        }
+    }
+}
+
+/// A shared-trunk U-Net at half resolution that learns in minutes on one core.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Compact {
+    /// Channels at strides 2, 4, 8 and 16.
+    pub channels: [usize; 4],
+    /// Residual blocks at strides 2, 4, 8 and 16.
+    pub blocks: [usize; 4],
+    /// Query and key feature channels.
+    pub feature_channels: usize,
+    /// Edge length of the query window round the pick, in cells of stride 2. Odd.
+    pub window_cells: usize,
+}
+
+impl Default for Compact {
+    fn default() -> Self {
+        Self {
+            channels: [16, 32, 64, 128],
+            blocks: [1, 1, 1, 2],
+            feature_channels: 8,
+            window_cells: 25,
+        }
+    }
+}
+
+/// How an image is sampled between its cells.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Interpolation {
+    /// The nearest cell: edges stay sharp.
+    #[default]
+    Nearest,
+    /// The mean of the four nearest cells, by distance.
+    Bilinear,
+}
+
+fn check(
+    what: &'static str,
+    good: bool,
+    actual: impl ToString,
+    expected: &'static str,
+) -> Result<(), Error> {
+    if good {
+        return Ok(());
+    }
+    Err(Error::Config {
+        what,
+        actual: actual.to_string(),
+        expected,
+    })
+}
+
+impl NetworkConfig {
+    /// A network on the Ravens workspace, 36 rotations, next-step goals.
+    pub fn new(network: Network) -> Self {
+        Self {
+            rows: rows(),
+            cols: cols(),
+            pixel_size_m: pixel_size_m(),
+            rotations: rotations(),
+            conditioning: GoalConditioning::default(),
+            network,
+        }
+    }
+
+    /// The compact network with its default sizes.
+    pub fn compact() -> Self {
+        Self::new(Network::Compact(Compact::default()))
+    }
+
+    /// The published network.
+    pub fn resnet43() -> Self {
+        Self::new(Network::Resnet43(Resnet43::default()))
+    }
+
+    /// Refuses sizes that no network can be made of.
+    pub fn check(&self) -> Result<(), Error> {
+        let size = |size: usize| (16..=4096).contains(&size) && size.is_multiple_of(16);
+        let a_size = "a multiple of 16 from 16 to 4096";
+        check("rows", size(self.rows), self.rows, a_size)?;
+        check("cols", size(self.cols), self.cols, a_size)?;
+        let pixel_size_m = self.pixel_size_m;
+        let good = pixel_size_m.is_finite() && pixel_size_m > 0.0;
+        check("pixel_size_m", good, pixel_size_m, "a positive number")?;
+        let good = (1..=360).contains(&self.rotations);
+        check("rotations", good, self.rotations, "1 to 360")?;
+        let channels = |channels: &usize| (1..=1024).contains(channels);
+        match &self.network {
+            Network::Resnet43(Resnet43 {
+                crop_px,
+                feature_channels,
+                ..
+            }) => {
+                let good = (16..=256).contains(crop_px) && crop_px.is_multiple_of(16);
+                check("crop_px", good, crop_px, "a multiple of 16 from 16 to 256")?;
+                let good = channels(feature_channels);
+                check("feature_channels", good, feature_channels, "1 to 1024")
+            }
+            Network::Compact(compact) => {
+                let good = compact.channels.iter().all(channels);
+                let actual = format!("{:?}", compact.channels);
+                check("channels", good, actual, "1 to 1024 each")?;
+                let good = compact.blocks.iter().all(|blocks| *blocks <= 16);
+                let actual = format!("{:?}", compact.blocks);
+                check("blocks", good, actual, "0 to 16 each")?;
+                let good = channels(&compact.feature_channels);
+                check(
+                    "feature_channels",
+                    good,
+                    compact.feature_channels,
+                    "1 to 1024",
+                )?;
+                let window_cells = compact.window_cells;
+                let good = (3..=255).contains(&window_cells) && window_cells % 2 == 1;
+                check(
+                    "window_cells",
+                    good,
+                    window_cells,
+                    "an odd number from 3 to 255",
+                )
+            }
+        }
+    }
+
+    /// Refuses heightmaps of another grid: the network has learned this one.
+    pub fn check_workspace(&self, workspace: &Workspace) -> Result<(), Error> {
+        let Self {
+            rows,
+            cols,
+            pixel_size_m,
+            ..
+        } = *self;
+        let same_pixel = (workspace.pixel_size_m - pixel_size_m).abs() < 1e-9;
+        if (workspace.rows, workspace.cols) == (rows, cols) && same_pixel {
+            return Ok(());
+        }
+        Err(Error::Workspace {
+            actual: format!(
+                "{}x{} cells of {} m",
+                workspace.rows, workspace.cols, workspace.pixel_size_m
+            ),
+            expected: format!("{rows}x{cols} cells of {pixel_size_m} m"),
+        })
+    }
+}
+
+/// How a network is trained.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct TrainingConfig {
+    /// Seed of weights, augmentation and wrong rotations.
+    pub seed: u64,
+    /// Gradient steps in all; the schedule ends there.
+    pub steps: u64,
+    /// Samples a gradient step.
+    pub batch: usize,
+    /// Largest learning rate.
+    pub learning_rate: f64,
+    /// Learning rate after the warm-up.
+    pub schedule: Schedule,
+    /// Steps over which the learning rate rises linearly from 0.
+    pub warm_up_steps: u64,
+    /// Decoupled weight decay of AdamW (Loshchilov and Hutter, 2019); 0 makes it Adam.
+    pub weight_decay: f64,
+    /// Largest norm of the gradient; none leaves it as it is.
+    pub gradient_clip: Option<f64>,
+    /// Place loss.
+    pub place_loss: PlaceLoss,
+    /// Standard deviation of the Gaussian that softens labels, in cells of the logits; 0: one hot.
+    pub label_sigma_cells: f64,
+    /// Augmentation of samples.
+    pub augmentation: Augmentation,
+    /// Kind of the convolutions' arithmetic; weights and optimiser stay f32.
+    #[serde(default)]
+    pub precision: Precision,
+    /// Threads of libtorch. Sums are split by thread: another number gives other last bits.
+    pub threads: usize,
+    /// Where to compute.
+    #[serde(default)]
+    pub device: Device,
+}
+
+/// Learning rate after the warm-up.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Schedule {
+    /// Stays.
+    Constant,
+    /// Half a cosine down to 0 at the last step.
+    Cosine,
+}
+
+/// Cross entropies that teach the place maps.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum PlaceLoss {
+    /// Over all cells and rotations, as published.
+    AllRotations,
+    /// Over all cells at the right rotation and a random wrong one, plus over all rotations at the true
+    /// place: nearly all of the signal for a fraction of the work.
+    RightAndOneWrong,
+}
+
+/// Kind of the convolutions' arithmetic.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Precision {
+    /// 32-bit floats.
+    #[default]
+    F32,
+    /// Brain floats of 16 bits.
+    Bf16,
+}
+
+/// Where to compute.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Device {
+    /// The processor.
+    #[default]
+    Cpu,
+    /// The first CUDA device.
+    Cuda,
+}
+
+/// Random rigid motions, and colours, of a sample (Zeng et al., CoRL 2020).
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Augmentation {
+    /// Standard deviation of the rotation about the middle of the image.
+    pub rotation_sigma_deg: f64,
+    /// Standard deviation of the translation along each axis.
+    pub translation_sigma_px: f64,
+    /// How images are sampled. Bilinear makes heights at edges that nothing has.
+    pub interpolation: Interpolation,
+    /// Share of samples whose colours are turned about the grey axis by a random angle, observation
+    /// and goal alike.
+    pub hue_probability: f64,
+    /// Standard deviation of the logarithm of a gain on each colour channel, observation and goal alike.
+    pub gain_sigma: f64,
+}
+
+impl Augmentation {
+    /// None at all.
+    pub const NONE: Self = Self {
+        rotation_sigma_deg: 0.0,
+        translation_sigma_px: 0.0,
+        interpolation: Interpolation::Nearest,
+        hue_probability: 0.0,
+        gain_sigma: 0.0,
+    };
+}
+
+impl Default for Augmentation {
+    /// As published: N(0, 60 deg) and N(0, 26.67 px), no colours.
+    fn default() -> Self {
+        Self {
+            rotation_sigma_deg: 60.0,
+            translation_sigma_px: 160.0 / 6.0,
+            ..Self::NONE
+        }
+    }
+}
+
+impl TrainingConfig {
+    /// What trained the compact network fastest: AdamW, cosine, batch 4.
+    pub fn compact() -> Self {
+        Self {
+            seed: 0,
+            steps: 2000,
+            batch: 4,
+            learning_rate: 1e-3,
+            schedule: Schedule::Cosine,
+            warm_up_steps: 50,
+            weight_decay: 0.01,
+            gradient_clip: Some(5.0),
+            place_loss: PlaceLoss::RightAndOneWrong,
+            label_sigma_cells: 0.7,
+            augmentation: Augmentation::default(),
+            precision: Precision::F32,
+            threads: 1,
+            device: Device::Cpu,
+        }
+    }
+
+    /// Training as published: Adam at 1e-4, one sample a step, 20,000 steps a task module.
+    pub fn published() -> Self {
+        Self {
+            steps: 20_000,
+            batch: 1,
+            learning_rate: 1e-4,
+            schedule: Schedule::Constant,
+            warm_up_steps: 0,
+            weight_decay: 0.0,
+            gradient_clip: None,
+            place_loss: PlaceLoss::AllRotations,
+            label_sigma_cells: 0.0,
+            threads: 2,
+            ..Self::compact()
+        }
+    }
+
+    /// Refuses values that cannot train.
+    pub fn check(&self) -> Result<(), Error> {
+        let not_negative = |value: f64| value.is_finite() && value >= 0.0;
+        let rate = self.learning_rate;
+        let augmentation = &self.augmentation;
+        let probability = augmentation.hue_probability;
+        check("steps", self.steps > 0, self.steps, "at least 1")?;
+        let good = (1..=1024).contains(&self.batch);
+        check("batch", good, self.batch, "1 to 1024")?;
+        let good = rate.is_finite() && rate > 0.0;
+        check("learning_rate", good, rate, "a positive number")?;
+        if let Some(clip) = self.gradient_clip {
+            let good = clip.is_finite() && clip > 0.0;
+            check("gradient_clip", good, clip, "a positive number or nothing")?;
+        }
+        for (what, value) in [
+            ("weight_decay", self.weight_decay),
+            ("label_sigma_cells", self.label_sigma_cells),
+            ("rotation_sigma_deg", augmentation.rotation_sigma_deg),
+            ("translation_sigma_px", augmentation.translation_sigma_px),
+            ("gain_sigma", augmentation.gain_sigma),
+        ] {
+            check(what, not_negative(value), value, "0 or a positive number")?;
+        }
+        let good = (0.0..=1.0).contains(&probability);
+        check("hue_probability", good, probability, "0 to 1")?;
+        let good = (1..=1024).contains(&self.threads);
+        check("threads", good, self.threads, "1 to 1024")
+    }
+}

@@ -1,0 +1,106 @@
+//! What can go wrong.
+
+use std::path::PathBuf;
+
+/// What can go wrong in this crate.
+#[derive(Debug, thiserror::Error)]
+pub enum Error {
+    /// A value in a configuration makes no sense.
+    #[error("{what} is {actual}, expected {expected}")]
+    Config {
+        /// Name of the value.
+        what: &'static str,
+        /// Its value.
+        actual: String,
+        /// What was expected.
+        expected: &'static str,
+    },
+    /// A heightmap of another grid than the network's.
+    #[error("the heightmap has {actual}, the network expects {expected}")]
+    Workspace {
+        /// The heightmap's grid.
+        actual: String,
+        /// The network's grid.
+        expected: String,
+    },
+    /// An observation or a goal whose parts do not fit, or that is not finite.
+    #[error("the {what}: {source}")]
+    Heightmap {
+        /// Observation or goal.
+        what: &'static str,
+        /// What is wrong with it.
+        source: heightmap::HeightmapError,
+    },
+    /// A training label off the heightmap, or not finite.
+    #[error(
+        "sample {index}: the {what} pose ({x_m} m, {y_m} m, {yaw_rad} rad) is not on the heightmap"
+    )]
+    Label {
+        /// Index of the sample in the batch.
+        index: usize,
+        /// Pick or place.
+        what: &'static str,
+        /// World position, x.
+        x_m: f64,
+        /// World position, y.
+        y_m: f64,
+        /// Yaw in the world.
+        yaw_rad: f64,
+    },
+    /// A batch of another size than configured.
+    #[error("a batch of {actual} samples, expected {expected}")]
+    Batch {
+        /// Samples given.
+        actual: usize,
+        /// Samples configured.
+        expected: usize,
+    },
+    /// The network answered with a number that is none, or training diverged.
+    #[error("{what} is not finite{}", step.map(|step| format!(" at step {step}")).unwrap_or_default())]
+    NotFinite {
+        /// Which quantity.
+        what: &'static str,
+        /// Training step, when training.
+        step: Option<u64>,
+    },
+    /// Every cell is excluded from picking.
+    #[error("all cells are within {radius_m} m of the {count} excluded picks")]
+    NothingToPick {
+        /// Number of excluded picks.
+        count: usize,
+        /// Radius about each.
+        radius_m: f64,
+    },
+    /// A file that is no checkpoint of this crate, or a broken one.
+    #[error("{}: {problem}", path.display())]
+    Checkpoint {
+        /// The file.
+        path: PathBuf,
+        /// What is wrong with it.
+        problem: String,
+    },
+    /// A tensor in a checkpoint that does not fit the network.
+    #[error("{}: tensor {tensor}: {problem}", path.display())]
+    CheckpointTensor {
+        /// The file.
+        path: PathBuf,
+        /// Name of the tensor.
+        tensor: String,
+        /// What is wrong with it.
+        problem: String,
+    },
+    /// The file system refused.
+    #[error("{}: {source}", path.display())]
+    Io {
+        /// The file.
+        path: PathBuf,
+        /// Why.
+        source: std::io::Error,
+    },
+    /// The device cannot be used.
+    #[error("no CUDA device can be used: this libtorch has none, or there is no card")]
+    NoCuda,
+    /// libtorch refused.
+    #[error("libtorch: {0}")]
+    Torch(#[from] tch::TchError),
+}

@@ -1,1 +1,9 @@
 //! UR5 kinematics, trajectories and the work cell read from its URDF.
+
+mod arm;
+mod trajectory;
+mod work_cell;
+
+pub use arm::{Arm, DhLengths, Joints, Solutions, Unreachable};
+pub use trajectory::{JointTrajectory, PlanError, Sampler, TrajectoryPoint};
+pub use work_cell::{Body, Shape, WorkCell, WorkCellError};

@@ -1,0 +1,475 @@
+//! The work cell from urdf/.
+
+use crate::{Arm, DhLengths, Joints};
+use nalgebra::{Isometry3, Translation3, UnitQuaternion, Vector3};
+use std::collections::BTreeMap;
+use std::path::Path;
+use urdf_rs::{Geometry, JointType};
+
+/// What the URDF says about the cell.
+#[derive(Clone, Debug)]
+pub struct WorkCell {
+    /// The arm.
+    pub arm: Arm,
+    /// Names of the arm's joints, in order, as in `joint_states` and trajectories.
+    pub joint_names: [String; 6],
+    /// Name and pose of each camera's optical frame in the world, in the order of the URDF.
+    pub cameras: Vec<(String, Isometry3<f64>)>,
+    /// What is seen, in the order of the URDF.
+    pub visuals: Vec<Body>,
+    /// What collides, in the order of the URDF.
+    pub collisions: Vec<Body>,
+}
+
+/// A primitive shape, centred on its frame; lengths in m.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Shape {
+    /// A box with these edges.
+    Cuboid {
+        /// Edge lengths along x, y and z.
+        size_m: Vector3<f64>,
+    },
+    /// A cylinder along z.
+    Cylinder {
+        /// Radius.
+        radius_m: f64,
+        /// Length.
+        length_m: f64,
+    },
+    /// A ball.
+    Sphere {
+        /// Radius.
+        radius_m: f64,
+    },
+}
+
+/// A shape on a link.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Body {
+    /// Name of the link.
+    pub link: String,
+    /// The shape.
+    pub shape: Shape,
+    /// Colour.
+    pub rgb: [u8; 3],
+    /// Which of the arm's moving links carries it: 0 (shoulder) to 5 (flange and gripper), or
+    /// none when it stands still.
+    pub moving_link: Option<usize>,
+    /// Pose of the shape in the frame of that moving link, or in the world.
+    pub pose: Isometry3<f64>,
+}
+
+/// Why a URDF does not describe a work cell.
+#[derive(Debug, thiserror::Error)]
+pub enum WorkCellError {
+    /// The file cannot be read or parsed.
+    #[error("{path}: {reason}")]
+    Unreadable {
+        /// The file.
+        path: String,
+        /// What the parser said.
+        reason: String,
+    },
+    /// A link or joint that the cell needs is missing or of another kind.
+    #[error("{path}: {expected}")]
+    Missing {
+        /// The file.
+        path: String,
+        /// What was expected.
+        expected: String,
+    },
+}
+
+/// Where the arm rests: folded back over its own base, tool down, outside every line of sight
+/// from the cameras to the workspace.
+const HOME_DEG: [f64; 6] = [0.0, -160.0, 120.0, -50.0, -90.0, 0.0];
+/// How far, in m and rad, a joint's frame may be off a UR arm's.
+const FRAME_TOLERANCE: f64 = 1e-6;
+
+const URDF: &str = include_str!("../../../urdf/workcell.urdf");
+
+impl WorkCell {
+    /// The cell of `urdf/workcell.urdf`, as it was when this was compiled.
+    ///
+    /// # Errors
+    /// As [`Self::parse`].
+    pub fn builtin() -> Result<Self, WorkCellError> {
+        Self::parse(URDF, "urdf/workcell.urdf")
+    }
+
+    /// Reads a URDF.
+    ///
+    /// # Errors
+    /// When it cannot be read, or as [`Self::parse`].
+    pub fn load(path: &Path) -> Result<Self, WorkCellError> {
+        let name = path.display().to_string();
+        let text = std::fs::read_to_string(path).map_err(|error| WorkCellError::Unreadable {
+            path: name.clone(),
+            reason: error.to_string(),
+        })?;
+        Self::parse(&text, &name)
+    }
+
+    /// Reads the text of a URDF. It must hold a chain of six revolute joints with a UR arm's
+    /// geometry up to a link `suction_tip`, by way of a link `tool0`; links named
+    /// `NAME_camera_optical_frame` are cameras; everything else is fixed. `path` names it in
+    /// errors.
+    ///
+    /// # Errors
+    /// Says what is missing or wrong.
+    pub fn parse(text: &str, path: &str) -> Result<Self, WorkCellError> {
+        let robot = urdf_rs::read_from_string(text).map_err(|error| WorkCellError::Unreadable {
+            path: path.into(),
+            reason: error.to_string(),
+        })?;
+        Self::from_robot(&robot).map_err(|expected| WorkCellError::Missing {
+            path: path.into(),
+            expected,
+        })
+    }
+
+    fn from_robot(robot: &urdf_rs::Robot) -> Result<Self, String> {
+        let tree = Tree::new(robot)?;
+        let arm_joints = tree.arm_joints()?;
+        let arm = read_arm(&tree, &arm_joints)?;
+        let mut cell = Self {
+            arm,
+            joint_names: arm_joints.map(|joint| joint.name.clone()),
+            cameras: Vec::new(),
+            visuals: Vec::new(),
+            collisions: Vec::new(),
+        };
+        let mut colors = BTreeMap::new();
+        for material in &robot.materials {
+            if let Some(color) = &material.color {
+                colors.insert(material.name.as_str(), color.rgba.0);
+            }
+        }
+        for link in &robot.links {
+            let (moving_link, link_pose) = tree.carrier(&link.name, &arm_joints)?;
+            if let Some(name) = link.name.strip_suffix("_camera_optical_frame") {
+                if moving_link.is_some() {
+                    return Err(format!(
+                        "camera link {} rides on the arm, expected it fixed",
+                        link.name
+                    ));
+                }
+                cell.cameras.push((name.into(), link_pose));
+            }
+            let body = |geometry, origin, rgb| {
+                Ok::<_, String>(Body {
+                    link: link.name.clone(),
+                    shape: read_shape(geometry, &link.name)?,
+                    rgb,
+                    moving_link,
+                    pose: link_pose * read_pose(origin, &link.name)?,
+                })
+            };
+            for visual in &link.visual {
+                let rgb = read_color(visual.material.as_ref(), &colors, &link.name)?;
+                cell.visuals
+                    .push(body(&visual.geometry, &visual.origin, rgb)?);
+            }
+            for collision in &link.collision {
+                cell.collisions
+                    .push(body(&collision.geometry, &collision.origin, [0; 3])?);
+            }
+        }
+        if cell.cameras.is_empty() {
+            return Err("no link NAME_camera_optical_frame, expected at least one camera".into());
+        }
+        Ok(cell)
+    }
+
+    /// What is seen and where in the world at a joint position, for rendering.
+    pub fn shapes<'a>(
+        &'a self,
+        joints: &Joints,
+    ) -> impl Iterator<Item = (&'a Body, Isometry3<f64>)> {
+        self.posed(&self.visuals, joints)
+    }
+
+    /// Poses in the world of bodies at a joint position.
+    pub fn posed<'a>(
+        &self,
+        bodies: &'a [Body],
+        joints: &Joints,
+    ) -> impl Iterator<Item = (&'a Body, Isometry3<f64>)> + use<'a> {
+        let links = self.arm.links(joints);
+        bodies.iter().map(move |body| {
+            let pose = body
+                .moving_link
+                .map_or(body.pose, |link| links[link] * body.pose);
+            (body, pose)
+        })
+    }
+}
+
+/// The URDF as a tree.
+struct Tree<'a> {
+    /// The joint above each link.
+    above: BTreeMap<&'a str, &'a urdf_rs::Joint>,
+}
+
+impl<'a> Tree<'a> {
+    fn new(robot: &'a urdf_rs::Robot) -> Result<Self, String> {
+        let mut links = std::collections::BTreeSet::new();
+        for link in &robot.links {
+            if !links.insert(link.name.as_str()) {
+                return Err(format!("two links are named {}", link.name));
+            }
+        }
+        let mut above = BTreeMap::new();
+        for joint in &robot.joints {
+            for link in [&joint.parent.link, &joint.child.link] {
+                if !links.contains(link.as_str()) {
+                    return Err(format!(
+                        "joint {} names the link {link}, which does not exist",
+                        joint.name
+                    ));
+                }
+            }
+            if let Some(other) = above.insert(joint.child.link.as_str(), joint) {
+                return Err(format!(
+                    "link {} hangs on both {} and {}",
+                    joint.child.link, other.name, joint.name
+                ));
+            }
+        }
+        let tree = Self { above };
+        let mut roots: Vec<_> = links
+            .iter()
+            .map(|link| tree.up(link))
+            .collect::<Result<_, _>>()?;
+        let mut roots: Vec<&str> = roots.iter_mut().map(|(root, _)| *root).collect();
+        roots.sort_unstable();
+        roots.dedup();
+        match roots.as_slice() {
+            [_] => Ok(tree),
+            _ => Err(format!("expected one root link, found {roots:?}")),
+        }
+    }
+
+    /// The root above a link, and the joints from the link up to it.
+    fn up(&self, link: &'a str) -> Result<(&'a str, Vec<&'a urdf_rs::Joint>), String> {
+        let mut joints = Vec::new();
+        let mut at = link;
+        while let Some(joint) = self.above.get(at) {
+            joints.push(*joint);
+            if joints.len() > self.above.len() {
+                return Err(format!("the joints above link {link} form a circle"));
+            }
+            at = &joint.parent.link;
+        }
+        Ok((at, joints))
+    }
+
+    /// The six moving joints between the root and the suction tip.
+    fn arm_joints(&self) -> Result<[&'a urdf_rs::Joint; 6], String> {
+        if !self.above.contains_key("suction_tip") {
+            return Err("no link suction_tip on a joint".into());
+        }
+        let (_, mut joints) = self.up("suction_tip")?;
+        joints.retain(|joint| joint.joint_type != JointType::Fixed);
+        joints.reverse();
+        let names: Vec<&str> = joints.iter().map(|joint| joint.name.as_str()).collect();
+        let joints: [_; 6] = joints.try_into().map_err(|_| {
+            format!("expected six moving joints up to suction_tip, found {names:?}")
+        })?;
+        for joint in joints {
+            if joint.joint_type != JointType::Revolute {
+                return Err(format!("joint {} is not revolute", joint.name));
+            }
+            if joint.axis.xyz.0 != [0.0, 0.0, 1.0] {
+                return Err(format!(
+                    "axis of joint {} is {:?}, expected z",
+                    joint.name, joint.axis.xyz.0
+                ));
+            }
+        }
+        Ok(joints)
+    }
+
+    /// Which of the arm's moving links carries a link, and the link's pose there or in the world.
+    fn carrier(
+        &self,
+        link: &'a str,
+        arm_joints: &[&urdf_rs::Joint; 6],
+    ) -> Result<(Option<usize>, Isometry3<f64>), String> {
+        let mut pose = Isometry3::identity();
+        for joint in self.up(link)?.1 {
+            if let Some(index) = arm_joints
+                .iter()
+                .position(|other| std::ptr::eq(*other, joint))
+            {
+                return Ok((Some(index), pose));
+            }
+            if joint.joint_type != JointType::Fixed {
+                return Err(format!(
+                    "joint {} moves but is no joint of the arm",
+                    joint.name
+                ));
+            }
+            pose = read_pose(&joint.origin, &joint.name)? * pose;
+        }
+        Ok((None, pose))
+    }
+
+    /// Pose of a joint's frame at zero in the frame of the moving link below it.
+    fn origin(
+        &self,
+        joint: &'a urdf_rs::Joint,
+        arm_joints: &[&urdf_rs::Joint; 6],
+    ) -> Result<Isometry3<f64>, String> {
+        let (_, parent) = self.carrier(&joint.parent.link, arm_joints)?;
+        Ok(parent * read_pose(&joint.origin, &joint.name)?)
+    }
+}
+
+fn read_arm<'a>(tree: &Tree<'a>, arm_joints: &[&'a urdf_rs::Joint; 6]) -> Result<Arm, String> {
+    let (_, world_from_base) = tree.carrier(&arm_joints[0].parent.link, arm_joints)?;
+    let mut origins = [Isometry3::identity(); 6];
+    for (origin, joint) in origins.iter_mut().zip(arm_joints) {
+        *origin = tree.origin(joint, arm_joints)?;
+    }
+    // The first origin counts from the base, not from the world.
+    origins[0] = world_from_base.inv_mul(&origins[0]);
+    let at = |joint: usize| origins[joint].translation.vector;
+    let lengths = DhLengths {
+        d1_m: at(0).z,
+        a2_m: at(2).x,
+        a3_m: at(3).x,
+        d4_m: at(3).z,
+        d5_m: -at(4).y,
+        d6_m: at(5).y,
+    };
+    for ((found, expected), joint) in origins.iter().zip(lengths.joint_origins()).zip(arm_joints) {
+        let shift = (found.translation.vector - expected.translation.vector).norm();
+        let turn = found.rotation.angle_to(&expected.rotation);
+        if shift > FRAME_TOLERANCE || turn > FRAME_TOLERANCE {
+            return Err(format!(
+                "joint {} sits at {found}, expected {expected} for the geometry of a UR arm: \
+                 closed-form inverse kinematics needs parallel and crossing axes",
+                joint.name
+            ));
+        }
+    }
+    for (name, length) in [("upper arm", lengths.a2_m), ("forearm", lengths.a3_m)] {
+        if length.abs() < FRAME_TOLERANCE {
+            return Err(format!("the {name} has no length"));
+        }
+    }
+    let mut limits_rad = (Joints::zeros(), Joints::zeros());
+    let mut max_speed_rad_s = Joints::zeros();
+    for (i, joint) in arm_joints.iter().enumerate() {
+        let limit = &joint.limit;
+        let ordered =
+            limit.lower < limit.upper && limit.lower.is_finite() && limit.upper.is_finite();
+        if !ordered || !(limit.velocity > 0.0 && limit.velocity.is_finite()) {
+            return Err(format!(
+                "limits of joint {} are not finite, ordered and positive",
+                joint.name
+            ));
+        }
+        limits_rad.0[i] = limit.lower;
+        limits_rad.1[i] = limit.upper;
+        max_speed_rad_s[i] = limit.velocity;
+    }
+    let flange = |link: &'static str| match tree.carrier(link, arm_joints)? {
+        (Some(5), pose) => Ok(pose),
+        _ => Err(format!(
+            "link {link} is not fixed to the last joint of the arm"
+        )),
+    };
+    if !tree.above.contains_key("tool0") {
+        return Err("no link tool0 on a joint".into());
+    }
+    let tool0 = flange("tool0")?;
+    if tool0.translation.vector.norm() > FRAME_TOLERANCE || tool0.rotation.angle() > FRAME_TOLERANCE
+    {
+        return Err(format!(
+            "link tool0 sits at {tool0} on the last joint, expected no offset"
+        ));
+    }
+    let arm = Arm {
+        world_from_base,
+        flange_from_tip: flange("suction_tip")?,
+        lengths,
+        limits_rad,
+        max_speed_rad_s,
+        home: Joints::from(HOME_DEG).map(f64::to_radians),
+    };
+    if !arm.within_limits(&arm.home) {
+        return Err(format!(
+            "joint limits exclude the home position {HOME_DEG:?} degrees"
+        ));
+    }
+    Ok(arm)
+}
+
+fn read_pose(pose: &urdf_rs::Pose, place: &str) -> Result<Isometry3<f64>, String> {
+    let ([x, y, z], [roll, pitch, yaw]) = (pose.xyz.0, pose.rpy.0);
+    if ![x, y, z, roll, pitch, yaw]
+        .iter()
+        .all(|value| value.is_finite())
+    {
+        return Err(format!("an origin of {place} is not finite"));
+    }
+    Ok(Isometry3::from_parts(
+        Translation3::new(x, y, z),
+        UnitQuaternion::from_euler_angles(roll, pitch, yaw),
+    ))
+}
+
+fn read_shape(geometry: &Geometry, link: &str) -> Result<Shape, String> {
+    let shape = match *geometry {
+        Geometry::Box { size } => Shape::Cuboid {
+            size_m: Vector3::from(size.0),
+        },
+        Geometry::Cylinder { radius, length } => Shape::Cylinder {
+            radius_m: radius,
+            length_m: length,
+        },
+        Geometry::Sphere { radius } => Shape::Sphere { radius_m: radius },
+        Geometry::Capsule { .. } | Geometry::Mesh { .. } => {
+            return Err(format!(
+                "a shape of link {link} is a capsule or mesh, expected box, cylinder or sphere"
+            ));
+        }
+    };
+    let lengths = match shape {
+        Shape::Cuboid { size_m } => [size_m.x, size_m.y, size_m.z],
+        Shape::Cylinder { radius_m, length_m } => [radius_m, length_m, 1.0],
+        Shape::Sphere { radius_m } => [radius_m, 1.0, 1.0],
+    };
+    if !lengths
+        .iter()
+        .all(|length| *length > 0.0 && length.is_finite())
+    {
+        return Err(format!(
+            "a shape of link {link} has a length that is not positive and finite"
+        ));
+    }
+    Ok(shape)
+}
+
+fn read_color(
+    material: Option<&urdf_rs::Material>,
+    named: &BTreeMap<&str, [f64; 4]>,
+    link: &str,
+) -> Result<[u8; 3], String> {
+    let material = material.ok_or_else(|| format!("a shape of link {link} has no material"))?;
+    let rgba = match &material.color {
+        Some(color) => color.rgba.0,
+        None => *named
+            .get(material.name.as_str())
+            .ok_or_else(|| format!("material {:?} of link {link} has no colour", material.name))?,
+    };
+    if !rgba.iter().all(|value| (0.0..=1.0).contains(value)) {
+        return Err(format!(
+            "material {:?} of link {link} has a colour outside 0..1",
+            material.name
+        ));
+    }
+    Ok([rgba[0], rgba[1], rgba[2]].map(|value| (value * 255.0).round() as u8))
+}

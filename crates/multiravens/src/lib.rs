@@ -1,1 +1,15 @@
 //! MultiRavens on Rapier: simulated work cell, rendering, task modules, problems, demonstrators.
+
+mod cell;
+mod colors;
+mod environment;
+mod problem;
+pub mod render;
+mod stage;
+pub mod tasks;
+pub mod world;
+
+pub use cell::{Cell, CellError, MAX_LAG_M, MotionEnd, Tick};
+pub use environment::{Assessment, Environment, EnvironmentError, StepReport};
+pub use problem::{Placement, Problem, ProblemError};
+pub use tasks::{Task, TaskModule};

@@ -1,0 +1,369 @@
+//! The simulated hardware behind the UR driver's interface: arm, suction, cameras.
+
+use crate::render::{RenderError, RgbdImage};
+use crate::stage::Stage;
+use crate::world::{self, World};
+use heightmap::{Camera, Intrinsics, View};
+use pick_place::Robot;
+use std::time::Duration;
+use ur5::{JointTrajectory, Joints, WorkCell};
+
+/// The arm counts as home within this distance of each joint.
+const HOME_TOLERANCE_RAD: f64 = 1e-3;
+/// A trajectory must begin within this distance of each present joint position.
+const START_TOLERANCE_RAD: f64 = 1e-2;
+/// The lag rule: a tip further behind stops the arm (an over-pulled cable).
+pub const MAX_LAG_M: f64 = 0.02;
+/// A motion is over when the tip has caught up this far, ...
+const CAUGHT_UP_M: f64 = 1e-3;
+/// ... or when it has had this long to do so.
+const CATCH_UP_STEPS: u64 = world::STEPS_PER_SECOND as u64 / 2;
+/// Settled: every free body slower than this (Ravens) ...
+const REST_SPEED_M_S: f64 = 5e-3;
+/// ... for this long without a break, since a body is also slow where it turns back.
+const REST_STEPS: u64 = world::STEPS_PER_SECOND as u64 / 20;
+/// What has not come to rest by then is left as it is.
+const MAX_SETTLE_STEPS: u64 = 10 * world::STEPS_PER_SECOND as u64;
+
+/// What a tick has done.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Tick {
+    /// No motion is under way: simulated time stands still.
+    Idle,
+    /// The motion goes on.
+    Moving,
+    /// The motion has just ended.
+    Ended(MotionEnd),
+}
+
+/// How a motion ended.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum MotionEnd {
+    /// At the end of its trajectory.
+    Reached,
+    /// At a contact, as asked for.
+    Contact,
+    /// By the lag rule: the tip was more than [`MAX_LAG_M`] behind.
+    Lag,
+}
+
+/// A command that the cell refuses.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+pub enum CellError {
+    /// One motion at a time.
+    #[error("a motion is under way")]
+    Busy,
+    /// A trajectory starts elsewhere.
+    #[error("the trajectory starts at {start}, the arm is at {present}")]
+    Jump {
+        /// First joint position of the trajectory, in rad.
+        start: Joints,
+        /// Present joint position, in rad.
+        present: Joints,
+    },
+    /// The physics left the finite numbers.
+    #[error("the state of a body became non-finite")]
+    Broken,
+}
+
+#[derive(Debug)]
+struct Motion {
+    trajectory: JointTrajectory,
+    until_contact: bool,
+    steps: u64,
+    phase: Phase,
+}
+
+#[derive(Clone, Copy, Debug)]
+enum Phase {
+    Moving,
+    /// The trajectory is over, the tip is still behind.
+    CatchingUp(u64),
+    /// Home with nothing held.
+    Settling(Rest),
+}
+
+/// How long all bodies have been slow, and how long that was waited for.
+#[derive(Clone, Copy, Debug, Default)]
+struct Rest {
+    slow: u64,
+    waited: u64,
+}
+
+impl Rest {
+    /// Looks at the world after a step; says whether waiting is over.
+    fn is_over(&mut self, world: &World) -> bool {
+        self.waited += 1;
+        self.slow = if world.fastest_m_s() < REST_SPEED_M_S {
+            self.slow + 1
+        } else {
+            0
+        };
+        self.slow >= REST_STEPS || self.waited >= MAX_SETTLE_STEPS
+    }
+
+    fn rests(&self) -> bool {
+        self.slow >= REST_STEPS
+    }
+}
+
+/// A work cell in simulation.
+///
+/// Simulated time advances in [`Self::tick`] and [`Self::settle`] only. A motion that ends with
+/// the arm at home and nothing held is reported as ended when all bodies have come to rest, so
+/// that whoever drives the cell, tick by tick or through [`Robot`], sees the same times and states.
+pub struct Cell {
+    work_cell: WorkCell,
+    world: World,
+    joints: Joints,
+    motion: Option<Motion>,
+    suction: bool,
+    settled: bool,
+    stage: Stage,
+}
+
+impl Cell {
+    /// An empty table, the arm at home.
+    pub fn new(work_cell: &WorkCell) -> Self {
+        let cameras = work_cell.cameras.iter();
+        let cameras = cameras.map(|(name, world_from_camera)| Camera {
+            name: name.clone(),
+            intrinsics: Intrinsics::RAVENS,
+            world_from_camera: *world_from_camera,
+        });
+        let joints = work_cell.arm.home;
+        Self {
+            world: World::new(&work_cell.arm.tip(&joints)),
+            stage: Stage::new(cameras.collect()),
+            work_cell: work_cell.clone(),
+            joints,
+            motion: None,
+            suction: false,
+            settled: false,
+        }
+    }
+
+    /// Clears the table and puts the arm at home, for another episode.
+    pub fn clear(&mut self) {
+        self.joints = self.work_cell.arm.home;
+        self.world = World::new(&self.work_cell.arm.tip(&self.joints));
+        self.motion = None;
+        self.suction = false;
+        self.settled = false;
+    }
+
+    /// The arm and the cameras.
+    pub fn work_cell(&self) -> &WorkCell {
+        &self.work_cell
+    }
+
+    /// What is on the table.
+    pub fn world(&self) -> &World {
+        &self.world
+    }
+
+    /// What is on the table, to set up a scene.
+    pub fn world_mut(&mut self) -> &mut World {
+        self.settled = false;
+        &mut self.world
+    }
+
+    /// Present joint positions.
+    pub fn joints(&self) -> Joints {
+        self.joints
+    }
+
+    /// Whether the arm is out of the cameras' sight.
+    pub fn is_home(&self) -> bool {
+        (self.joints - self.work_cell.arm.home).amax() < HOME_TOLERANCE_RAD
+    }
+
+    /// Whether a motion is under way.
+    pub fn is_moving(&self) -> bool {
+        self.motion.is_some()
+    }
+
+    /// Whether all bodies have come to rest since something last moved.
+    pub fn is_settled(&self) -> bool {
+        self.settled
+    }
+
+    /// Simulated time since the table was cleared.
+    pub fn time(&self) -> Duration {
+        self.world.time()
+    }
+
+    /// Whether suction is switched on.
+    pub fn suction(&self) -> bool {
+        self.suction
+    }
+
+    /// Whether the vacuum sensor says that something is held.
+    pub fn holds(&self) -> bool {
+        self.world.held().is_some()
+    }
+
+    /// Switches suction. Takes no simulated time.
+    pub fn set_suction(&mut self, on: bool) {
+        if on && !self.suction {
+            self.world.grasp();
+        } else if !on {
+            self.world.release();
+        }
+        self.suction = on;
+        self.settled = false;
+    }
+
+    /// Begins to follow a trajectory, to its end or `until_contact`.
+    pub fn begin(
+        &mut self,
+        trajectory: JointTrajectory,
+        until_contact: bool,
+    ) -> Result<(), CellError> {
+        if self.motion.is_some() {
+            return Err(CellError::Busy);
+        }
+        let start = trajectory.sample(Duration::ZERO);
+        // Not "further than": NaN is refused, too.
+        let near = (start - self.joints).amax() <= START_TOLERANCE_RAD;
+        if !near {
+            let present = self.joints;
+            return Err(CellError::Jump { start, present });
+        }
+        self.settled = false;
+        self.motion = Some(Motion {
+            trajectory,
+            until_contact,
+            steps: 0,
+            phase: Phase::Moving,
+        });
+        Ok(())
+    }
+
+    /// Stops where the arm is; says whether there was a motion to stop.
+    pub fn cancel(&mut self) -> bool {
+        self.motion.take().is_some()
+    }
+
+    /// One physics step of the motion under way.
+    pub fn tick(&mut self) -> Result<Tick, CellError> {
+        let Some(mut motion) = self.motion.take() else {
+            return Ok(Tick::Idle);
+        };
+        motion.steps += 1;
+        let elapsed = world::time_of(motion.steps);
+        if let Phase::Moving = motion.phase {
+            self.joints = motion.trajectory.sample(elapsed);
+        }
+        self.step()?;
+        let ended = match &mut motion.phase {
+            Phase::Settling(rest) => {
+                let over = rest.is_over(&self.world);
+                self.settled = rest.rests();
+                over.then_some(MotionEnd::Reached)
+            }
+            _ if motion.until_contact && self.world.touches() => Some(MotionEnd::Contact),
+            _ if self.world.lag_m() > MAX_LAG_M => Some(MotionEnd::Lag),
+            Phase::Moving => {
+                if elapsed >= motion.trajectory.duration() {
+                    motion.phase = Phase::CatchingUp(0);
+                }
+                None
+            }
+            Phase::CatchingUp(waited) => {
+                *waited += 1;
+                let over = self.world.lag_m() < CAUGHT_UP_M || *waited >= CATCH_UP_STEPS;
+                if over && self.is_home() && self.world.held().is_none() {
+                    motion.phase = Phase::Settling(Rest::default());
+                    None
+                } else {
+                    over.then_some(MotionEnd::Reached)
+                }
+            }
+        };
+        Ok(match ended {
+            Some(end) => Tick::Ended(end),
+            None => {
+                self.motion = Some(motion);
+                Tick::Moving
+            }
+        })
+    }
+
+    /// Lets all bodies come to rest; says whether they did within 10 s of simulated time.
+    pub fn settle(&mut self) -> Result<bool, CellError> {
+        if self.motion.is_some() {
+            return Err(CellError::Busy);
+        }
+        let mut rest = Rest::default();
+        loop {
+            self.step()?;
+            if rest.is_over(&self.world) {
+                self.settled = rest.rests();
+                return Ok(self.settled);
+            }
+        }
+    }
+
+    /// What the cameras see now.
+    pub fn render(&mut self) -> Result<&[RgbdImage], RenderError> {
+        self.stage
+            .render(&self.work_cell, &self.joints, &self.world)
+    }
+
+    /// The images of the last [`Self::render`] with their cameras.
+    pub fn views(&self) -> impl Iterator<Item = View<'_>> {
+        self.stage.views()
+    }
+
+    /// The cameras, in the order of [`Self::render`].
+    pub fn cameras(&self) -> &[Camera] {
+        self.stage.cameras()
+    }
+
+    fn step(&mut self) -> Result<(), CellError> {
+        self.world.step(&self.work_cell.arm.tip(&self.joints));
+        if self.world.is_broken() {
+            return Err(CellError::Broken);
+        }
+        Ok(())
+    }
+
+    fn run(
+        &mut self,
+        trajectory: &JointTrajectory,
+        until_contact: bool,
+    ) -> Result<MotionEnd, CellError> {
+        self.begin(trajectory.clone(), until_contact)?;
+        loop {
+            if let Tick::Ended(end) = self.tick()? {
+                return Ok(end);
+            }
+        }
+    }
+}
+
+impl Robot for Cell {
+    type Error = CellError;
+
+    fn joints(&mut self) -> Result<Joints, CellError> {
+        Ok(self.joints)
+    }
+
+    fn follow(&mut self, trajectory: &JointTrajectory) -> Result<bool, CellError> {
+        Ok(self.run(trajectory, false)? == MotionEnd::Reached)
+    }
+
+    fn follow_until_contact(&mut self, trajectory: &JointTrajectory) -> Result<bool, CellError> {
+        Ok(self.run(trajectory, true)? == MotionEnd::Contact)
+    }
+
+    fn set_suction(&mut self, on: bool) -> Result<(), CellError> {
+        Cell::set_suction(self, on);
+        Ok(())
+    }
+
+    fn holds(&mut self) -> Result<bool, CellError> {
+        Ok(Cell::holds(self))
+    }
+}

@@ -1,0 +1,10 @@
+//! Colours of bodies: the palette of Ravens.
+
+/// What lies beyond the table.
+pub const BACKGROUND: [u8; 3] = [24, 24, 26];
+/// The plate of *placing*.
+pub const PLATE: [u8; 3] = [36, 36, 38];
+/// Red.
+pub const RED: [u8; 3] = [255, 87, 89];
+/// Blue.
+pub const BLUE: [u8; 3] = [78, 121, 167];

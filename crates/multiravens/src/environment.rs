@@ -1,0 +1,313 @@
+//! Problems as episodes: reset, observe, step.
+
+use crate::cell::{Cell, CellError};
+use crate::problem::Problem;
+use crate::render::RenderError;
+use crate::tasks::Task;
+use heightmap::{Fusion, FusionError, Heightmap, View, Workspace};
+use nalgebra::Isometry2;
+use pick_place::{Outcome, PickPlace, PrimitiveSettings};
+use rand::SeedableRng;
+use rand_chacha::ChaCha8Rng;
+use std::time::Duration;
+use ur5::WorkCell;
+
+/// Stream of the seed's random numbers that the demonstrator draws from; the modules use 0, 1, ...
+const DEMONSTRATOR_STREAM: u64 = 1 << 32;
+
+/// A problem in a simulated work cell.
+///
+/// A seed gives the same scene, and the same actions the same states, bit for bit. The demonstrator
+/// draws from its own stream of random numbers.
+pub struct Environment {
+    problem: Problem,
+    cell: Cell,
+    tasks: Vec<Progress>,
+    demonstrator: ChaCha8Rng,
+    seed: u64,
+    steps: usize,
+    fusion: Fusion,
+    heightmap: Heightmap,
+}
+
+struct Progress {
+    name: &'static str,
+    task: Box<dyn Task>,
+    reached: usize,
+}
+
+impl Progress {
+    fn is_complete(&self) -> bool {
+        self.reached == self.task.goal_count()
+    }
+}
+
+/// Rewards after a step, from the true state of the bodies.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Assessment {
+    /// Change of the total reward by this step; negative where a goal was lost again.
+    pub delta_reward: f64,
+    /// Reward of the present state: the mean over the modules of the share of goals reached.
+    pub total_reward: f64,
+    /// Whether every goal of every module is reached.
+    pub complete: bool,
+    /// Whether the episode is over: complete, or out of steps.
+    pub done: bool,
+}
+
+/// What a step has done.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct StepReport {
+    /// How the primitive ended.
+    pub outcome: Outcome,
+    /// Change of the total reward by this step; negative where a goal was lost again.
+    pub delta_reward: f64,
+    /// Reward of the present state.
+    pub total_reward: f64,
+    /// Whether every goal of every module is reached.
+    pub complete: bool,
+    /// Whether the episode is over: complete, or out of steps.
+    pub done: bool,
+    /// The module that was being solved, whose primitive settings were used.
+    pub module: &'static str,
+    /// Whether all bodies came to rest.
+    pub settled: bool,
+    /// Simulated time since the reset.
+    pub time: Duration,
+}
+
+/// Why an environment could not do what it was told. Nothing has moved after `Action` and `Over`.
+#[derive(Debug, thiserror::Error)]
+pub enum EnvironmentError {
+    /// An action that is not finite or not over the workspace.
+    #[error("{which} pose x {x_m} m, y {y_m} m, yaw {yaw_rad} rad: expected finite and in x {x0}..{x1}, y {y0}..{y1}",
+        x_m = pose.translation.x, y_m = pose.translation.y, yaw_rad = pose.rotation.angle(),
+        x0 = workspace.origin_m.x, x1 = workspace.origin_m.x + workspace.cols as f64 * workspace.pixel_size_m,
+        y0 = workspace.origin_m.y, y1 = workspace.origin_m.y + workspace.rows as f64 * workspace.pixel_size_m)]
+    Action {
+        /// `pick` or `place`.
+        which: &'static str,
+        /// The pose.
+        pose: Isometry2<f64>,
+        /// Where it should be.
+        workspace: Workspace,
+    },
+    /// A step after the end of the episode.
+    #[error("the episode is over: reset first")]
+    Over,
+    /// The bodies of a new episode did not come to rest.
+    #[error("problem {problem}, seed {seed}: the scene does not come to rest")]
+    Restless {
+        /// Name of the problem.
+        problem: String,
+        /// The seed.
+        seed: u64,
+    },
+    /// The simulated hardware refused.
+    #[error(transparent)]
+    Cell(#[from] CellError),
+    /// A camera's image could not be rendered.
+    #[error(transparent)]
+    Render(#[from] RenderError),
+    /// The images could not be fused.
+    #[error(transparent)]
+    Fusion(#[from] FusionError),
+}
+
+impl Environment {
+    /// An environment that has to be [`Self::reset`] before its first step.
+    pub fn new(problem: &Problem, work_cell: &WorkCell) -> Self {
+        Self {
+            problem: problem.clone(),
+            cell: Cell::new(work_cell),
+            tasks: Vec::new(),
+            demonstrator: ChaCha8Rng::seed_from_u64(0),
+            seed: 0,
+            steps: 0,
+            fusion: Fusion::default(),
+            heightmap: Heightmap::new(Workspace::RAVENS),
+        }
+    }
+
+    /// Begins the episode of a seed.
+    pub fn reset(&mut self, seed: u64) -> Result<(), EnvironmentError> {
+        self.seed = seed;
+        self.steps = 0;
+        self.tasks.clear();
+        self.cell.clear();
+        self.demonstrator = stream(seed, DEMONSTRATOR_STREAM);
+        for (index, placement) in self.problem.modules().iter().enumerate() {
+            let mut rng = stream(seed, index as u64);
+            let world = self.cell.world_mut();
+            let task = placement.module.build(world, &placement.anchor, &mut rng);
+            self.tasks.push(Progress {
+                name: placement.name,
+                task,
+                reached: 0,
+            });
+        }
+        if !self.cell.settle()? {
+            let problem = self.problem.name().to_owned();
+            return Err(EnvironmentError::Restless { problem, seed });
+        }
+        for progress in &mut self.tasks {
+            progress.reached = progress.task.reached(self.cell.world());
+        }
+        Ok(())
+    }
+
+    /// What the three cameras see, fused.
+    pub fn observe(&mut self) -> Result<&Heightmap, EnvironmentError> {
+        self.cell.render()?;
+        let views: Vec<View<'_>> = self.cell.views().collect();
+        self.fusion.fuse(&views, &mut self.heightmap)?;
+        Ok(&self.heightmap)
+    }
+
+    /// The demonstrator's next action; `None` when it knows none.
+    pub fn demonstrate(&mut self) -> Option<PickPlace> {
+        let index = self.current()?;
+        let task = &mut self.tasks[index].task;
+        task.demonstrate(self.cell.world(), &mut self.demonstrator)
+    }
+
+    /// Carries out an action with the settings of the module being solved, and assesses it.
+    pub fn step(&mut self, action: &PickPlace) -> Result<StepReport, EnvironmentError> {
+        check(action)?;
+        let module = self.module();
+        let (Some(settings), false) = (self.settings(), self.is_done()) else {
+            return Err(EnvironmentError::Over);
+        };
+        let arm = self.cell.work_cell().arm.clone();
+        let outcome = pick_place::execute(&mut self.cell, &arm, action, &settings, |_| ())?;
+        let assessment = self.assess();
+        Ok(StepReport {
+            outcome,
+            delta_reward: assessment.delta_reward,
+            total_reward: assessment.total_reward,
+            complete: assessment.complete,
+            done: assessment.done,
+            module: module.unwrap_or_default(),
+            settled: self.cell.is_settled(),
+            time: self.cell.time(),
+        })
+    }
+
+    /// Ends a step: looks at the settled bodies, once after every action. [`Self::step`] does this;
+    /// who drives the cell tick by tick calls it when the arm is back home.
+    pub fn assess(&mut self) -> Assessment {
+        let before = self.total_reward();
+        self.steps += 1;
+        for progress in &mut self.tasks {
+            progress.reached = progress.task.reached(self.cell.world());
+        }
+        let total_reward = self.total_reward();
+        Assessment {
+            delta_reward: total_reward - before,
+            total_reward,
+            complete: self.is_complete(),
+            done: self.is_done(),
+        }
+    }
+
+    /// Reward of the present state: the mean over the modules of the share of goals reached.
+    pub fn total_reward(&self) -> f64 {
+        let shares = self
+            .tasks
+            .iter()
+            .map(|p| p.reached as f64 / p.task.goal_count() as f64);
+        shares.sum::<f64>() / self.tasks.len().max(1) as f64
+    }
+
+    /// Whether every goal of every module is reached.
+    pub fn is_complete(&self) -> bool {
+        self.tasks.iter().all(Progress::is_complete)
+    }
+
+    /// Whether the episode is over: complete, or out of steps.
+    pub fn is_done(&self) -> bool {
+        self.is_complete() || self.steps >= self.max_steps()
+    }
+
+    /// Steps taken since the reset.
+    pub fn steps(&self) -> usize {
+        self.steps
+    }
+
+    /// Steps after which the episode is over: the sum over the modules.
+    pub fn max_steps(&self) -> usize {
+        self.tasks.iter().map(|p| p.task.max_steps()).sum()
+    }
+
+    /// Number of goals of all modules together.
+    pub fn goal_count(&self) -> usize {
+        self.tasks.iter().map(|p| p.task.goal_count()).sum()
+    }
+
+    /// The module being solved: the first that is not complete.
+    pub fn module(&self) -> Option<&'static str> {
+        self.current().map(|index| self.tasks[index].name)
+    }
+
+    /// Primitive settings of the module being solved.
+    pub fn settings(&self) -> Option<PrimitiveSettings> {
+        self.current()
+            .map(|index| self.tasks[index].task.settings())
+    }
+
+    /// The tasks of this episode, by module, in the order in which they are solved.
+    pub fn tasks(&self) -> impl Iterator<Item = (&'static str, &dyn Task)> {
+        self.tasks.iter().map(|p| (p.name, p.task.as_ref()))
+    }
+
+    /// The problem.
+    pub fn problem(&self) -> &Problem {
+        &self.problem
+    }
+
+    /// The seed of this episode.
+    pub fn seed(&self) -> u64 {
+        self.seed
+    }
+
+    /// The simulated hardware.
+    pub fn cell(&self) -> &Cell {
+        &self.cell
+    }
+
+    /// The simulated hardware, for a node that drives it.
+    pub fn cell_mut(&mut self) -> &mut Cell {
+        &mut self.cell
+    }
+
+    /// Equal for equal states of the bodies at equal times.
+    pub fn state_hash(&self) -> u64 {
+        self.cell.world().state_hash()
+    }
+
+    fn current(&self) -> Option<usize> {
+        self.tasks.iter().position(|p| !p.is_complete())
+    }
+}
+
+fn stream(seed: u64, stream: u64) -> ChaCha8Rng {
+    let mut rng = ChaCha8Rng::seed_from_u64(seed);
+    rng.set_stream(stream);
+    rng
+}
+
+/// Refuses poses that are not finite or not over the workspace.
+fn check(action: &PickPlace) -> Result<(), EnvironmentError> {
+    let workspace = Workspace::RAVENS;
+    for (which, pose) in [("pick", action.pick), ("place", action.place)] {
+        let inside = workspace.pixel(&pose.translation.vector.into()).is_some();
+        if !(inside && pose.rotation.angle().is_finite()) {
+            return Err(EnvironmentError::Action {
+                which,
+                pose,
+                workspace,
+            });
+        }
+    }
+    Ok(())
+}

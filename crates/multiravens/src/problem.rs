@@ -1,0 +1,254 @@
+//! Problems: task modules composed on one table, read from YAML.
+
+use crate::tasks::{REGISTRY, TaskModule};
+use heightmap::Workspace;
+use nalgebra::{Isometry2, Point2, Vector2};
+use serde::Deserialize;
+use serde_yaml_ng::Value;
+use std::path::{Path, PathBuf};
+use std::sync::Arc;
+
+/// A problem: what is built about which anchor, solved in this order.
+#[derive(Clone, Debug)]
+pub struct Problem {
+    name: String,
+    modules: Vec<Placement>,
+}
+
+/// A task module at its place on the table.
+#[derive(Clone, Debug)]
+pub struct Placement {
+    /// The module's name in [`crate::tasks::REGISTRY`].
+    pub name: &'static str,
+    /// Pose of the module's frame in the world.
+    pub anchor: Isometry2<f64>,
+    /// The module with its parameters.
+    pub module: Arc<dyn TaskModule>,
+}
+
+/// A problem file that is not one.
+#[derive(Debug, thiserror::Error)]
+#[error("{file}: {reason}")]
+pub struct ProblemError {
+    /// The file.
+    pub file: PathBuf,
+    /// What is wrong, and where in the file.
+    pub reason: String,
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct File {
+    modules: Vec<Entry>,
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Entry {
+    name: String,
+    anchor: Anchor,
+    #[serde(default)]
+    parameters: Value,
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct Anchor {
+    x_m: f64,
+    y_m: f64,
+    #[serde(default)]
+    yaw_rad: f64,
+}
+
+impl Problem {
+    /// Reads `NAME.yaml` from a directory of problems.
+    pub fn load(directory: &Path, name: &str) -> Result<Self, ProblemError> {
+        let file = directory.join(format!("{name}.yaml"));
+        let fail = |reason: String| ProblemError {
+            file: file.clone(),
+            reason,
+        };
+        let plain = |c: char| c.is_ascii_alphanumeric() || "_-+".contains(c);
+        if name.is_empty() || !name.chars().all(plain) {
+            let reason = format!("`{name}` is no problem name: letters, digits, `_`, `-`, `+`");
+            return Err(fail(reason));
+        }
+        let text = std::fs::read_to_string(&file).map_err(|error| {
+            let known = Self::names(directory).unwrap_or_default();
+            let known = known.join(", ");
+            fail(format!("no problem `{name}` ({error}); there are: {known}"))
+        })?;
+        Self::parse(name, &text).map_err(fail)
+    }
+
+    /// Names of the problems in a directory, sorted.
+    pub fn names(directory: &Path) -> std::io::Result<Vec<String>> {
+        let mut names = Vec::new();
+        for entry in std::fs::read_dir(directory)? {
+            let path = entry?.path();
+            if path.extension().is_some_and(|e| e == "yaml")
+                && let Some(stem) = path.file_stem().and_then(|s| s.to_str())
+            {
+                names.push(stem.to_owned());
+            }
+        }
+        names.sort();
+        Ok(names)
+    }
+
+    /// Reads the text of a problem file.
+    pub fn parse(name: &str, text: &str) -> Result<Self, String> {
+        let file: File = serde_yaml_ng::from_str(text).map_err(|e| e.to_string())?;
+        if file.modules.is_empty() {
+            return Err("modules: expected at least one".into());
+        }
+        let mut modules: Vec<Placement> = Vec::new();
+        for (index, entry) in file.modules.into_iter().enumerate() {
+            let placement = entry.place().map_err(|e| format!("modules[{index}].{e}"))?;
+            let area = placement.area();
+            let workspace = Workspace::RAVENS;
+            if let Some(out) = area.iter().find(|p| workspace.pixel(p).is_none()) {
+                return Err(format!(
+                    "modules[{index}] ({}): reaches out of the workspace at x {:.3}, y {:.3}",
+                    placement.name, out.x, out.y
+                ));
+            }
+            for (earlier, other) in modules.iter().enumerate() {
+                if overlap(&area, &other.area()) {
+                    return Err(format!(
+                        "modules[{index}] ({}): overlaps modules[{earlier}] ({})",
+                        placement.name, other.name
+                    ));
+                }
+            }
+            modules.push(placement);
+        }
+        Ok(Self {
+            name: name.to_owned(),
+            modules,
+        })
+    }
+
+    /// The problem's name.
+    pub fn name(&self) -> &str {
+        &self.name
+    }
+
+    /// The modules, in the order in which they are solved.
+    pub fn modules(&self) -> &[Placement] {
+        &self.modules
+    }
+}
+
+impl Entry {
+    fn place(self) -> Result<Placement, String> {
+        let known = REGISTRY.iter().find(|(name, _)| *name == self.name);
+        let (name, configure) = known.ok_or_else(|| {
+            let names: Vec<_> = REGISTRY.iter().map(|(name, _)| *name).collect();
+            let names = names.join(", ");
+            format!("name: no module `{}`; there are: {names}", self.name)
+        })?;
+        let Anchor { x_m, y_m, yaw_rad } = self.anchor;
+        for (field, value) in [("x_m", x_m), ("y_m", y_m), ("yaw_rad", yaw_rad)] {
+            if !value.is_finite() {
+                return Err(format!("anchor.{field}: is {value}, expected a number"));
+            }
+        }
+        let module = configure(self.parameters).map_err(|e| format!("parameters: {e}"))?;
+        Ok(Placement {
+            name,
+            anchor: Isometry2::new(Vector2::new(x_m, y_m), yaw_rad),
+            module: module.into(),
+        })
+    }
+}
+
+impl Placement {
+    /// Corners of the module's footprint in the world, in order round it.
+    pub fn area(&self) -> [Point2<f64>; 4] {
+        let half = self.module.footprint_m() / 2.0;
+        [(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)]
+            .map(|(x, y)| self.anchor * Point2::new(x * half.x, y * half.y))
+    }
+}
+
+/// Whether two rectangles overlap: no edge of either separates them.
+fn overlap(a: &[Point2<f64>; 4], b: &[Point2<f64>; 4]) -> bool {
+    // Neighbours may touch; rounding must not make that an overlap.
+    const TOUCHING_M: f64 = 1e-9;
+    let separated = |a: &[Point2<f64>; 4], b: &[Point2<f64>; 4]| {
+        (0..4).any(|i| {
+            let (from, to) = (a[i], a[(i + 1) % 4]);
+            let outward = Vector2::new(to.y - from.y, from.x - to.x).normalize();
+            b.iter().all(|p| (p - from).dot(&outward) >= -TOUCHING_M)
+        })
+    };
+    !separated(a, b) && !separated(b, a)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn error(text: &str) -> String {
+        Problem::parse("test", text).unwrap_err()
+    }
+
+    #[test]
+    fn an_error_names_the_module_and_the_field() {
+        assert!(error("modules: []").contains("at least one"));
+        assert!(error("modules: 3").contains("modules"));
+        let e = error("modules: [{name: placing, anchor: {x_m: 0.5}}]");
+        assert!(e.contains("modules[0].anchor") && e.contains("y_m"), "{e}");
+        let e = error("modules: [{name: juggling, anchor: {x_m: 0.5, y_m: 0}}]");
+        assert!(e.contains("juggling") && e.contains("placing"), "{e}");
+        let e = error("modules: [{name: placing, anchor: {x_m: .nan, y_m: 0}}]");
+        assert!(e.contains("anchor.x_m"), "{e}");
+        let e = error("modules: [{name: placing, anchor: {x_m: 0.5, y_m: 0}, colour: red}]");
+        assert!(e.contains("colour"), "{e}");
+        let e = error(
+            "modules: [{name: placing, anchor: {x_m: 0.5, y_m: 0}, parameters: {tolerance: 1}}]",
+        );
+        assert!(
+            e.contains("modules[0].parameters") && e.contains("tolerance"),
+            "{e}"
+        );
+        let e = error(
+            "modules: [{name: placing, anchor: {x_m: 0.5, y_m: 0}, parameters: {tolerance_m: 0.5}}]",
+        );
+        assert!(e.contains("tolerance_m") && e.contains("0.03"), "{e}");
+    }
+
+    #[test]
+    fn modules_stay_on_the_table_and_off_each_other() {
+        let e = error("modules: [{name: placing, anchor: {x_m: 0.3, y_m: 0}}]");
+        assert!(e.contains("workspace"), "{e}");
+        let two = |y: f64| {
+            format!(
+                "modules: [{{name: placing, anchor: {{x_m: 0.5, y_m: 0}}}},
+                           {{name: placing, anchor: {{x_m: 0.5, y_m: {y}, yaw_rad: 0.1}}}}]"
+            )
+        };
+        assert!(error(&two(0.2)).contains("overlaps modules[0]"));
+    }
+
+    #[test]
+    fn rectangles_that_touch_do_not_overlap() {
+        let square = |x: f64, yaw: f64| {
+            let pose = Isometry2::new(Vector2::new(x, 0.0), yaw);
+            [(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)]
+                .map(|(x, y)| pose * Point2::new(x, y))
+        };
+        assert!(overlap(&square(0.0, 0.0), &square(1.9, 0.0)));
+        assert!(!overlap(&square(0.0, 0.0), &square(2.0, 0.0)));
+        let eighth = std::f64::consts::FRAC_PI_4;
+        assert!(overlap(&square(0.0, 0.0), &square(2.3, eighth)));
+        assert!(!overlap(&square(0.0, 0.0), &square(2.45, eighth)));
+    }
+
+    #[test]
+    fn a_problem_name_is_no_path() {
+        let e = Problem::load(Path::new("."), "../placing").unwrap_err();
+        assert!(e.to_string().contains("no problem name"), "{e}");
+    }
+}

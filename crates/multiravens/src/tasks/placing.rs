@@ -1,0 +1,312 @@
+//! *placing*: nine disks onto a 3 x 3 grid on a dark grey square plate (paper, appendix).
+//!
+//! Five "even" disks start left of the plate, four "odd" ones right of it. Cells are numbered row
+//! by row; even disks belong on cells of even number, odd ones on the others. The disks of a
+//! parity are big or small, which gives four goal configurations. Any disk of the right parity
+//! will do for a cell.
+//!
+//! Module frame: x along the table's short side when the anchor's yaw is 0; left is +y.
+
+use super::{ParameterError, Task, TaskModule, at_height, check_range, read_parameters};
+use crate::colors;
+use crate::world::{BodyId, Mobility, Part, Shape, World};
+use nalgebra::{Isometry2, Isometry3, Point2, Vector2, Vector3};
+use pick_place::{PickPlace, PrimitiveSettings};
+use rand::RngExt;
+use rand::seq::IndexedRandom;
+use rand_chacha::ChaCha8Rng;
+use serde::{Deserialize, Serialize};
+use serde_yaml_ng::Value;
+use std::f64::consts::TAU;
+
+/// Edge length of the plate, and its height.
+const PLATE_M: f64 = 0.22;
+const PLATE_HEIGHT_M: f64 = 0.004;
+/// Distance of neighbouring cells' centres.
+const PITCH_M: f64 = 0.07;
+const BIG_RADIUS_M: f64 = 0.026;
+const SMALL_RADIUS_M: f64 = 0.019;
+const DISK_HEIGHT_M: f64 = 0.012;
+const DISK_MASS_KG: f64 = 0.02;
+const SUCTION_FORCE_N: f64 = 5.0;
+const FRICTION: f64 = 0.5;
+/// Disks start in a strip on either side of the plate: from here to there along |y|, ...
+const STRIP_M: (f64, f64) = (0.12, 0.2);
+/// ... and as long as this along x, ...
+const STRIP_LENGTH_M: f64 = 0.42;
+/// ... with at least this gap.
+const START_GAP_M: f64 = 0.01;
+/// A disk lies on the plate if its centre is this close to the height where it should be, ...
+const HEIGHT_TOLERANCE_M: f64 = 2e-3;
+/// ... and its axis this close to upright.
+const TILT_TOLERANCE_RAD: f64 = 0.1;
+
+const SETTINGS: PrimitiveSettings = PrimitiveSettings {
+    clearance_m: 0.08,
+    lift_m: 0.05,
+    travel_m_s: 0.8,
+    carry_m_s: 0.5,
+    descend_m_s: 0.1,
+    acceleration_m_s2: 2.5,
+};
+
+/// Parameters of the module in a problem file.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+struct Parameters {
+    /// How far a disk's centre may be from its cell's, in m.
+    tolerance_m: f64,
+    /// Size of the even disks: `big`, `small`, or `random`.
+    even: Size,
+    /// Size of the odd disks.
+    odd: Size,
+    /// The demonstrator picks within this share of a disk's radius about its centre.
+    pick_spread: f64,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+enum Size {
+    Random,
+    Big,
+    Small,
+}
+
+impl Default for Parameters {
+    fn default() -> Self {
+        Self {
+            tolerance_m: 0.01,
+            even: Size::Random,
+            odd: Size::Random,
+            pick_spread: 0.25,
+        }
+    }
+}
+
+/// Reads the module's parameters.
+pub(super) fn configure(parameters: Value) -> Result<Box<dyn TaskModule>, ParameterError> {
+    let parameters: Parameters = read_parameters(parameters)?;
+    // Beyond half the pitch a disk would be near two cells.
+    check_range("tolerance_m", parameters.tolerance_m, 1e-3, 0.03)?;
+    check_range("pick_spread", parameters.pick_spread, 0.0, 0.8)?;
+    Ok(Box::new(Placing { parameters }))
+}
+
+#[derive(Debug)]
+struct Placing {
+    parameters: Parameters,
+}
+
+/// A disk, and whether it is an even one.
+#[derive(Clone, Copy, Debug)]
+struct Disk {
+    body: BodyId,
+    even: bool,
+    radius_m: f64,
+}
+
+/// A goal.
+#[derive(Clone, Copy, Debug)]
+struct Cell {
+    center: Point2<f64>,
+    even: bool,
+}
+
+struct PlacingTask {
+    disks: Vec<Disk>,
+    cells: Vec<Cell>,
+    yaw_rad: f64,
+    parameters: Parameters,
+}
+
+impl TaskModule for Placing {
+    fn footprint_m(&self) -> Vector2<f64> {
+        Vector2::new(STRIP_LENGTH_M, 2.0 * STRIP_M.1)
+    }
+
+    fn build(
+        &self,
+        world: &mut World,
+        anchor: &Isometry2<f64>,
+        rng: &mut ChaCha8Rng,
+    ) -> Box<dyn Task> {
+        world.add(&Part {
+            shape: Shape::Cuboid {
+                size_m: Vector3::new(PLATE_M, PLATE_M, PLATE_HEIGHT_M),
+            },
+            pose: at_height(anchor, PLATE_HEIGHT_M / 2.0),
+            mobility: Mobility::Fixed,
+            friction: FRICTION,
+            rgb: colors::PLATE,
+        });
+        let mut disks = Vec::with_capacity(9);
+        let parities = [
+            (true, 5, 1.0, self.parameters.even, colors::RED),
+            (false, 4, -1.0, self.parameters.odd, colors::BLUE),
+        ];
+        for (even, count, side, size, rgb) in parities {
+            let big = match size {
+                Size::Random => rng.random_bool(0.5),
+                Size::Big => true,
+                Size::Small => false,
+            };
+            let radius_m = if big { BIG_RADIUS_M } else { SMALL_RADIUS_M };
+            for start in starts(count, radius_m, rng) {
+                let pose = anchor * Isometry2::translation(start.x, side * start.y);
+                let body = world.add(&Part {
+                    shape: Shape::Cylinder {
+                        radius_m,
+                        length_m: DISK_HEIGHT_M,
+                    },
+                    pose: at_height(&pose, DISK_HEIGHT_M / 2.0),
+                    mobility: Mobility::Free {
+                        mass_kg: DISK_MASS_KG,
+                        suction_force_n: SUCTION_FORCE_N,
+                    },
+                    friction: FRICTION,
+                    rgb,
+                });
+                disks.push(Disk {
+                    body,
+                    even,
+                    radius_m,
+                });
+            }
+        }
+        let cells = (0..9).map(|index| {
+            let (row, col) = (f64::from(index / 3) - 1.0, f64::from(index % 3) - 1.0);
+            Cell {
+                center: anchor * Point2::new(col * PITCH_M, row * PITCH_M),
+                even: index % 2 == 0,
+            }
+        });
+        Box::new(PlacingTask {
+            disks,
+            cells: cells.collect(),
+            yaw_rad: anchor.rotation.angle(),
+            parameters: self.parameters,
+        })
+    }
+}
+
+/// Random positions in the strip on the side of +y, none closer than a gap to another: uniform
+/// over all such rows of disks along x.
+fn starts(count: usize, radius_m: f64, rng: &mut ChaCha8Rng) -> Vec<Point2<f64>> {
+    let spacing = 2.0 * radius_m + START_GAP_M;
+    let slack = STRIP_LENGTH_M - 2.0 * radius_m - (count - 1) as f64 * spacing;
+    let mut along: Vec<f64> = (0..count).map(|_| rng.random_range(0.0..slack)).collect();
+    along.sort_by(f64::total_cmp);
+    let rows = along.iter().enumerate().map(|(index, along)| {
+        let x = along + index as f64 * spacing + radius_m - STRIP_LENGTH_M / 2.0;
+        let y = rng.random_range(STRIP_M.0 + radius_m..STRIP_M.1 - radius_m);
+        Point2::new(x, y)
+    });
+    rows.collect()
+}
+
+impl PlacingTask {
+    /// Whether a disk lies flat on the plate, centred on a cell.
+    fn lies_on(&self, cell: &Cell, disk: &Disk, world: &World) -> bool {
+        let pose = world.pose(disk.body);
+        let off = pose.translation.vector.xy() - cell.center.coords;
+        let height = PLATE_HEIGHT_M + DISK_HEIGHT_M / 2.0;
+        let up = pose.rotation * Vector3::z();
+        off.norm() < self.parameters.tolerance_m
+            && (pose.translation.z - height).abs() < HEIGHT_TOLERANCE_M
+            && up.z.abs() > TILT_TOLERANCE_RAD.cos()
+    }
+
+    fn holds_goal(&self, cell: &Cell, world: &World) -> bool {
+        let mut right = self.disks.iter().filter(|disk| disk.even == cell.even);
+        right.any(|disk| self.lies_on(cell, disk, world))
+    }
+
+    /// Whether a disk is where it belongs.
+    fn is_placed(&self, disk: &Disk, world: &World) -> bool {
+        let mut right = self.cells.iter().filter(|cell| cell.even == disk.even);
+        right.any(|cell| self.lies_on(cell, disk, world))
+    }
+
+    /// Whether no other disk is in the way of one put on a cell.
+    fn is_free(&self, cell: &Cell, disk: &Disk, world: &World) -> bool {
+        self.disks
+            .iter()
+            .filter(|other| other.body != disk.body)
+            .all(|other| {
+                let center = world.position(other.body).xy();
+                (center - cell.center).norm() > other.radius_m + disk.radius_m
+            })
+    }
+
+    fn is_covered(&self, disk: &Disk, world: &World) -> bool {
+        let center = world.position(disk.body);
+        self.disks.iter().any(|other| {
+            let other_center = world.position(other.body);
+            other.body != disk.body
+                && other_center.z > center.z + DISK_HEIGHT_M / 2.0
+                && (other_center.xy() - center.xy()).norm() < disk.radius_m + other.radius_m
+        })
+    }
+}
+
+impl Task for PlacingTask {
+    fn goal_count(&self) -> usize {
+        self.cells.len()
+    }
+
+    fn max_steps(&self) -> usize {
+        self.cells.len() + 2
+    }
+
+    fn settings(&self) -> PrimitiveSettings {
+        SETTINGS
+    }
+
+    fn goal_poses(&self) -> Vec<Isometry3<f64>> {
+        let height = PLATE_HEIGHT_M + DISK_HEIGHT_M / 2.0;
+        let poses = self
+            .cells
+            .iter()
+            .map(|cell| at_height(&Isometry2::new(cell.center.coords, self.yaw_rad), height));
+        poses.collect()
+    }
+
+    fn reached(&mut self, world: &World) -> usize {
+        let reached = self
+            .cells
+            .iter()
+            .filter(|cell| self.holds_goal(cell, world));
+        reached.count()
+    }
+
+    /// A random disk that is not placed yet and nothing lies on, to a random free cell of its
+    /// parity. The disk is gripped near its centre and set down so that its centre meets the cell's.
+    fn demonstrate(&mut self, world: &World, rng: &mut ChaCha8Rng) -> Option<PickPlace> {
+        let mut moves = Vec::new();
+        for disk in &self.disks {
+            if self.is_placed(disk, world) || self.is_covered(disk, world) {
+                continue;
+            }
+            let cells = self
+                .cells
+                .iter()
+                .filter(|cell| cell.even == disk.even && self.is_free(cell, disk, world));
+            let cells: Vec<_> = cells.collect();
+            if !cells.is_empty() {
+                moves.push((disk, cells));
+            }
+        }
+        let (disk, cells) = moves.choose(rng)?;
+        let cell = cells.choose(rng)?;
+        // Uniform over a small circle.
+        let radius =
+            self.parameters.pick_spread * disk.radius_m * rng.random_range(0.0..1.0f64).sqrt();
+        let angle = rng.random_range(0.0..TAU);
+        let offset = Vector2::new(angle.cos(), angle.sin()) * radius;
+        let center = world.position(disk.body).xy();
+        Some(PickPlace {
+            pick: Isometry2::new(center.coords + offset, 0.0),
+            place: Isometry2::new(cell.center.coords + offset, 0.0),
+        })
+    }
+}

@@ -1,0 +1,262 @@
+//! The physics of the table top: a Rapier world with the settings that small, light objects need.
+//!
+//! Lengths in metres, frame `world` (see [`heightmap`]). Nothing here knows an arm, a task or a
+//! camera.
+
+mod bead_chain;
+mod convert;
+mod suction;
+
+pub use bead_chain::BeadChain;
+pub use ur5::Shape;
+
+use convert::{from_point, from_pose, from_vector, to_pose};
+use nalgebra::{Isometry3, Point3, Vector3};
+use rapier3d::prelude::{
+    ColliderBuilder, ColliderHandle, PhysicsWorld, RigidBodyBuilder, RigidBodyHandle,
+    SpringCoefficients, Vector,
+};
+use std::time::Duration;
+use suction::Suction;
+
+/// Physics steps in a second of simulated time.
+pub const STEPS_PER_SECOND: u32 = 480;
+
+/// Manifold points closer than this count as contact.
+const CONTACT_DISTANCE_M: f32 = 0.2e-3;
+
+/// What holds a body in place.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Mobility {
+    /// Bolted to the table.
+    Fixed,
+    /// Free to move.
+    Free {
+        /// Mass.
+        mass_kg: f64,
+        /// What the suction cup pulls with at most while it holds the body.
+        suction_force_n: f64,
+    },
+}
+
+/// A body to add to the world.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Part {
+    /// Geometry.
+    pub shape: Shape,
+    /// Pose of the shape's centre in the world.
+    pub pose: Isometry3<f64>,
+    /// Fixed or free.
+    pub mobility: Mobility,
+    /// Coulomb friction coefficient.
+    pub friction: f64,
+    /// Colour.
+    pub rgb: [u8; 3],
+}
+
+/// A body of a [`World`], in the order in which bodies were added.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
+pub struct BodyId(usize);
+
+/// A body as added.
+#[derive(Clone, Copy, Debug)]
+struct Body {
+    handle: RigidBodyHandle,
+    collider: ColliderHandle,
+    shape: Shape,
+    rgb: [u8; 3],
+    suction_force_n: f32,
+    fixed: bool,
+}
+
+/// Bodies on a table whose top is z = 0, and a compliant suction tip.
+pub struct World {
+    physics: PhysicsWorld,
+    bodies: Vec<Body>,
+    suction: Suction,
+    steps: u64,
+}
+
+impl World {
+    /// An empty table, the suction tip at `tip` (see [`Self::step`]).
+    pub fn new(tip: &Isometry3<f64>) -> Self {
+        let mut physics = PhysicsWorld {
+            gravity: Vector::new(0.0, 0.0, -9.81),
+            ..PhysicsWorld::default()
+        };
+        let parameters = &mut physics.integration_parameters;
+        parameters.dt = 1.0 / STEPS_PER_SECOND as f32;
+        parameters.num_solver_iterations = 4;
+        // Tolerances for objects of centimetres, not metres.
+        parameters.length_unit = 0.1;
+        // Recycled contacts are stale by millimetres at this scale.
+        parameters.contact_recycling = false;
+        parameters.contact_softness = SpringCoefficients {
+            natural_frequency: 60.0,
+            damping_ratio: 10.0,
+        };
+        parameters.static_contact_softness = SpringCoefficients {
+            natural_frequency: 120.0,
+            damping_ratio: 10.0,
+        };
+        // Wider than the workspace: what slips over its edge comes to rest instead of falling.
+        physics.insert_collider(
+            ColliderBuilder::cuboid(0.6, 0.85, 0.1)
+                .translation(Vector::new(0.5, 0.0, -0.1))
+                .friction(0.5),
+            None,
+        );
+        let suction = Suction::new(&mut physics, tip);
+        Self {
+            physics,
+            bodies: Vec::new(),
+            suction,
+            steps: 0,
+        }
+    }
+
+    /// Adds a body.
+    pub fn add(&mut self, part: &Part) -> BodyId {
+        let (builder, suction_force_n) = match part.mobility {
+            Mobility::Fixed => (RigidBodyBuilder::fixed(), 0.0),
+            Mobility::Free {
+                suction_force_n, ..
+            } => (RigidBodyBuilder::dynamic(), suction_force_n as f32),
+        };
+        self.insert(part, builder, suction_force_n)
+    }
+
+    fn insert(&mut self, part: &Part, builder: RigidBodyBuilder, suction_force_n: f32) -> BodyId {
+        let collider = match part.shape {
+            Shape::Sphere { radius_m } => ColliderBuilder::ball(radius_m as f32),
+            Shape::Cylinder { radius_m, length_m } => {
+                // The engine's cylinders stand along y.
+                ColliderBuilder::cylinder(length_m as f32 / 2.0, radius_m as f32)
+                    .rotation(Vector::new(std::f32::consts::FRAC_PI_2, 0.0, 0.0))
+            }
+            Shape::Cuboid { size_m } => {
+                let half = size_m / 2.0;
+                ColliderBuilder::cuboid(half.x as f32, half.y as f32, half.z as f32)
+            }
+        };
+        let collider = match part.mobility {
+            Mobility::Fixed => collider,
+            Mobility::Free { mass_kg, .. } => collider.mass(mass_kg as f32),
+        };
+        let (handle, collider) = self.physics.insert(
+            builder.pose(to_pose(&part.pose)),
+            collider.friction(part.friction as f32),
+        );
+        self.bodies.push(Body {
+            handle,
+            collider,
+            shape: part.shape,
+            rgb: part.rgb,
+            suction_force_n,
+            fixed: part.mobility == Mobility::Fixed,
+        });
+        BodyId(self.bodies.len() - 1)
+    }
+
+    /// All bodies, in the order in which they were added.
+    pub fn bodies(&self) -> impl Iterator<Item = BodyId> + use<> {
+        (0..self.bodies.len()).map(BodyId)
+    }
+
+    /// Pose of a body's centre.
+    pub fn pose(&self, body: BodyId) -> Isometry3<f64> {
+        from_pose(self.physics.bodies[self.bodies[body.0].handle].position())
+    }
+
+    /// Position of a body's centre.
+    pub fn position(&self, body: BodyId) -> Point3<f64> {
+        from_point(self.physics.bodies[self.bodies[body.0].handle].translation())
+    }
+
+    /// Geometry of a body.
+    pub fn shape(&self, body: BodyId) -> Shape {
+        self.bodies[body.0].shape
+    }
+
+    /// Colour of a body.
+    pub fn rgb(&self, body: BodyId) -> [u8; 3] {
+        self.bodies[body.0].rgb
+    }
+
+    /// Moves a body, at rest, to a pose: to set up a scene.
+    pub fn place(&mut self, body: BodyId, pose: &Isometry3<f64>) {
+        let body = &mut self.physics.bodies[self.bodies[body.0].handle];
+        body.set_position(to_pose(pose), true);
+        body.set_linvel(Vector::ZERO, true);
+        body.set_angvel(Vector::ZERO, true);
+    }
+
+    /// Speed of the fastest free body, in m/s.
+    pub fn fastest_m_s(&self) -> f64 {
+        let speeds = self.bodies.iter().map(|body| {
+            let body = &self.physics.bodies[body.handle];
+            // A sleeping body rests, whatever its last velocity was.
+            if body.is_sleeping() || body.is_fixed() {
+                0.0
+            } else {
+                f64::from(body.linvel().length())
+            }
+        });
+        speeds.fold(0.0, f64::max)
+    }
+
+    /// Velocity of a body's centre.
+    pub fn velocity_m_s(&self, body: BodyId) -> Vector3<f64> {
+        from_vector(self.physics.bodies[self.bodies[body.0].handle].linvel())
+    }
+
+    /// Whether a state became non-finite; the engine freezes such bodies.
+    pub fn is_broken(&self) -> bool {
+        !self.physics.quarantine().is_empty()
+    }
+
+    /// One step of 1 / [`STEPS_PER_SECOND`] while the arm puts the suction tip at `tip`, whose z
+    /// points out of the tool.
+    pub fn step(&mut self, tip: &Isometry3<f64>) {
+        self.suction.lead(&mut self.physics, tip);
+        self.physics.step();
+        self.steps += 1;
+    }
+
+    /// Simulated time.
+    pub fn time(&self) -> Duration {
+        time_of(self.steps)
+    }
+
+    /// FNV-1a over the bits of every body's pose and of the time: equal states, equal hashes.
+    pub fn state_hash(&self) -> u64 {
+        let mut hash = 0xcbf2_9ce4_8422_2325_u64;
+        let mut eat = |bytes: &[u8]| {
+            for byte in bytes {
+                hash = (hash ^ u64::from(*byte)).wrapping_mul(0x0000_0100_0000_01b3);
+            }
+        };
+        eat(&self.steps.to_le_bytes());
+        for body in &self.bodies {
+            let pose = self.physics.bodies[body.handle].position();
+            let (t, q) = (pose.translation, pose.rotation);
+            for value in [t.x, t.y, t.z, q.x, q.y, q.z, q.w] {
+                eat(&value.to_bits().to_le_bytes());
+            }
+        }
+        hash
+    }
+
+    /// Distance of the nearest manifold point between two colliders, if they are near.
+    fn distance_m(pair: &rapier3d::geometry::ContactPair) -> Option<f32> {
+        let points = pair.manifolds().iter().flat_map(|m| &m.points);
+        points.map(|point| point.dist).reduce(f32::min)
+    }
+}
+
+/// Duration of a number of physics steps.
+pub(crate) fn time_of(steps: u64) -> Duration {
+    let steps_per_second = u64::from(STEPS_PER_SECOND);
+    let nanos = (steps % steps_per_second) * 1_000_000_000 / steps_per_second;
+    Duration::new(steps / steps_per_second, nanos as u32)
+}

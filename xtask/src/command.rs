@@ -9,7 +9,9 @@ use std::process::Command;
 pub fn repository_root() -> PathBuf {
     let manifest = std::env::var_os("CARGO_MANIFEST_DIR")
         .map_or_else(|| PathBuf::from(env!("CARGO_MANIFEST_DIR")), PathBuf::from);
-    manifest.parent().map_or(manifest.clone(), Path::to_path_buf)
+    manifest
+        .parent()
+        .map_or(manifest.clone(), Path::to_path_buf)
 }
 
 /// Where Cargo puts what it builds: `CARGO_TARGET_DIR` if set, else `target` in the repository.
@@ -31,7 +33,9 @@ pub fn command(program: impl AsRef<OsStr>) -> Command {
 /// change between `cargo xtask test` and a plain `cargo test`, and compile torch-sys again each time.
 pub fn cargo() -> Command {
     let mut command = command(std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into()));
-    if std::env::var_os("LIBTORCH").is_some_and(|dir| Path::new(&dir) == repository_root().join(".libtorch")) {
+    if std::env::var_os("LIBTORCH")
+        .is_some_and(|dir| Path::new(&dir) == repository_root().join(".libtorch"))
+    {
         command.env_remove("LIBTORCH");
     }
     command
@@ -40,7 +44,9 @@ pub fn cargo() -> Command {
 /// Runs a command with its output passed through.
 pub fn run(command: &mut Command) -> Result<()> {
     let shown = shown(command);
-    let status = command.status().with_context(|| format!("cannot start `{shown}`"))?;
+    let status = command
+        .status()
+        .with_context(|| format!("cannot start `{shown}`"))?;
     if !status.success() {
         bail!("`{shown}` failed: {status}");
     }
@@ -50,7 +56,9 @@ pub fn run(command: &mut Command) -> Result<()> {
 /// Runs a command and returns what it printed; its error output becomes part of the error.
 pub fn output(command: &mut Command) -> Result<String> {
     let shown = shown(command);
-    let output = command.output().with_context(|| format!("cannot start `{shown}`"))?;
+    let output = command
+        .output()
+        .with_context(|| format!("cannot start `{shown}`"))?;
     if !output.status.success() {
         bail!(
             "`{shown}` failed: {}\n{}{}",
@@ -59,7 +67,8 @@ pub fn output(command: &mut Command) -> Result<String> {
             String::from_utf8_lossy(&output.stderr)
         );
     }
-    String::from_utf8(output.stdout).with_context(|| format!("`{shown}` printed text that is not UTF-8"))
+    String::from_utf8(output.stdout)
+        .with_context(|| format!("`{shown}` printed text that is not UTF-8"))
 }
 
 fn shown(command: &Command) -> String {
@@ -68,7 +77,11 @@ fn shown(command: &Command) -> String {
         let argument = argument.to_string_lossy();
         text.push(' ');
         // A script given with -c would fill the screen.
-        text.push_str(if argument.contains('\n') { "..." } else { &argument });
+        text.push_str(if argument.contains('\n') {
+            "..."
+        } else {
+            &argument
+        });
     }
     text
 }

@@ -46,7 +46,8 @@ pub fn set_up(python: &Path) -> Result<()> {
     let made = make(python, &work, &recipe);
     let result = made.and_then(|()| {
         if destination.exists() {
-            fs::remove_dir_all(&destination).with_context(|| format!("cannot remove the old {}", destination.display()))?;
+            fs::remove_dir_all(&destination)
+                .with_context(|| format!("cannot remove the old {}", destination.display()))?;
         }
         fs::rename(work.join("libtorch"), &destination)
             .with_context(|| format!("cannot move libtorch to {}", destination.display()))
@@ -63,13 +64,33 @@ fn make(python: &Path, work: &Path, recipe: &str) -> Result<()> {
     let (wheels, libtorch) = (work.join("wheels"), work.join("libtorch"));
     fs::create_dir_all(&wheels).with_context(|| format!("cannot make {}", wheels.display()))?;
     let mut pip = command(python);
-    pip.args(["-m", "pip", "download", "--quiet", "--disable-pip-version-check", "--no-deps", "--no-cache-dir"])
-        .args(["--python-version", "3.11", "--implementation", "cp", "--abi", "cp311", "--only-binary=:all:"]);
+    pip.args([
+        "-m",
+        "pip",
+        "download",
+        "--quiet",
+        "--disable-pip-version-check",
+        "--no-deps",
+        "--no-cache-dir",
+    ])
+    .args([
+        "--python-version",
+        "3.11",
+        "--implementation",
+        "cp",
+        "--abi",
+        "cp311",
+        "--only-binary=:all:",
+    ]);
     // pip takes these names literally: a wheel for an older glibc has to be asked for by name.
     for glibc in [28, 27, 26, 25, 24, 17] {
-        pip.arg("--platform").arg(format!("manylinux_2_{glibc}_x86_64"));
+        pip.arg("--platform")
+            .arg(format!("manylinux_2_{glibc}_x86_64"));
     }
-    pip.arg("--dest").arg(&wheels).arg("--require-hashes").arg("--requirement");
+    pip.arg("--dest")
+        .arg(&wheels)
+        .arg("--require-hashes")
+        .arg("--requirement");
     run(pip.arg(repository_root().join("xtask/libtorch-requirements.txt")))
         .context("cannot download libtorch: is a Python package index reachable with pip?")?;
     output(
@@ -121,8 +142,14 @@ mod tests {
 
     #[test]
     fn every_wheel_is_pinned_by_version_and_hash() {
-        for line in super::REQUIREMENTS.lines().filter(|line| !line.starts_with('#')) {
-            assert!(line.contains("==") && line.contains("--hash=sha256:"), "{line}");
+        for line in super::REQUIREMENTS
+            .lines()
+            .filter(|line| !line.starts_with('#'))
+        {
+            assert!(
+                line.contains("==") && line.contains("--hash=sha256:"),
+                "{line}"
+            );
         }
     }
 }

@@ -1,12 +1,16 @@
 //! Set-up, demonstration run and tests of the whole repository: `cargo xtask --help`.
 
 mod command;
+mod demo;
 mod libtorch;
+mod licences;
 mod python;
+mod stage;
 
+use anyhow::Result;
 use clap::{Parser, Subcommand};
 
-/// Set-up, demonstration run and tests of the whole repository.
+/// Set-up, demonstration run and tests of the whole repository
 #[derive(Parser)]
 #[command(name = "cargo xtask", bin_name = "cargo xtask")]
 struct Arguments {
@@ -17,11 +21,44 @@ struct Arguments {
 #[derive(Subcommand)]
 enum Task {
     /// Make what a plain `cargo build` needs: the slim libtorch in .libtorch
-    Setup,
+    Setup {
+        /// Also make what the end-to-end tests need: .venv with rclpy and our messages
+        #[arg(long)]
+        python: bool,
+    },
+    /// Run every check of the repository
+    Test {
+        /// Run only these stages
+        #[arg(long, value_enum, value_delimiter = ',')]
+        only: Vec<stage::Stage>,
+        /// Arguments for pytest, after --
+        #[arg(last = true)]
+        pytest: Vec<String>,
+    },
+    /// Run one problem through all nodes as processes, headless; the recording goes to out/demo
+    Demo {
+        /// Problem in config/problems
+        #[arg(long, default_value = "placing")]
+        problem: String,
+        /// Seed of the scene; test seeds start at 10000
+        #[arg(long, default_value_t = 10_000)]
+        seed: u64,
+    },
+    /// Check that every dependency has a permissive licence
+    Licences,
 }
 
-fn main() -> anyhow::Result<()> {
+fn main() -> Result<()> {
     match Arguments::parse().task {
-        Task::Setup => libtorch::set_up(&python::with_pip()?),
+        Task::Setup { python } => {
+            libtorch::set_up(&python::with_pip()?)?;
+            if python {
+                python::Environment::set_up()?;
+            }
+            Ok(())
+        }
+        Task::Test { only, pytest } => stage::run_all(&only, &pytest),
+        Task::Demo { problem, seed } => demo::run_problem(&problem, seed),
+        Task::Licences => licences::check(),
     }
 }

@@ -1,21 +1,224 @@
-//! The Python on this machine, and the virtual environment of the end-to-end tests.
+//! The Python on this machine, and the virtual environment of the end-to-end tests: rclpy, our messages, pytest.
 
-use crate::command::{command, output};
-use anyhow::{Context as _, Result, ensure};
-use std::path::PathBuf;
+use crate::command::{command, output, repository_root, run};
+use anyhow::{Context as _, Result, bail, ensure};
+use std::fs;
+use std::path::{Path, PathBuf};
+use std::process::Command;
+
+/// Oldest and newest CPython 3 for which there are ROS 2 wheels.
+const ROS_MINORS: std::ops::RangeInclusive<u32> = 10..=13;
 
 /// The machine's `python3`, checked to be 3.9 or newer and to have pip.
 pub fn with_pip() -> Result<PathBuf> {
     let python = PathBuf::from("python3");
-    let version = output(command(&python).args(["-c", "import sys; print(*sys.version_info[:2])"]))
-        .context("Python 3.9 or newer is needed (to fetch libtorch with pip), and `python3` does not run")?;
-    let mut numbers = version.split_whitespace().map(str::parse::<u32>);
+    let minor = minor_version(&python).context(
+        "Python 3.9 or newer is needed (to fetch libtorch with pip), and `python3` does not run",
+    )?;
     ensure!(
-        matches!((numbers.next(), numbers.next()), (Some(Ok(3)), Some(Ok(minor))) if minor >= 9),
-        "Python 3.9 or newer is needed, and `python3` is {}",
-        version.trim().replace(' ', ".")
+        minor >= 9,
+        "Python 3.9 or newer is needed, and `python3` is 3.{minor}"
     );
     output(command(&python).args(["-m", "pip", "--version"]))
         .context("`python3` has no pip: install it (Debian and Ubuntu: apt install python3-pip)")?;
     Ok(python)
+}
+
+/// The 11 of Python 3.11.
+fn minor_version(python: &Path) -> Result<u32> {
+    let script = "import sys; print(*sys.version_info[:2])";
+    let version = output(command(python).args(["-c", script]))?;
+    match version.split_whitespace().collect::<Vec<_>>()[..] {
+        ["3", minor] => minor.parse().with_context(|| {
+            format!(
+                "cannot read the version {version:?} of {}",
+                python.display()
+            )
+        }),
+        _ => bail!(
+            "{} is not Python 3 but {}",
+            python.display(),
+            version.trim()
+        ),
+    }
+}
+
+/// The virtual environment in `.venv`.
+pub struct Environment {
+    prefix: PathBuf,
+}
+
+impl Environment {
+    /// Makes `.venv` with ROS 2 and our messages; does nothing when it is there in the right version.
+    pub fn set_up() -> Result<Self> {
+        let root = repository_root();
+        let environment = Self {
+            prefix: root.join(".venv"),
+        };
+        environment.install_packages(&root)?;
+        environment.build_messages(&root)?;
+        Ok(environment)
+    }
+
+    /// A command that runs this environment's Python, with its programs first in PATH.
+    pub fn python(&self) -> Result<Command> {
+        let mut command = command(self.prefix.join("bin/python"));
+        let mut path = vec![self.prefix.join("bin")];
+        path.extend(std::env::split_paths(
+            &std::env::var_os("PATH").unwrap_or_default(),
+        ));
+        command
+            .env("PATH", std::env::join_paths(path)?)
+            .env("VIRTUAL_ENV", &self.prefix)
+            .env("AMENT_PREFIX_PATH", &self.prefix)
+            .env("CMAKE_PREFIX_PATH", &self.prefix)
+            // Another ROS install in the shell must not mix in.
+            .env_remove("PYTHONPATH")
+            .env_remove("PYTHONHOME");
+        Ok(command)
+    }
+
+    fn install_packages(&self, root: &Path) -> Result<()> {
+        let stamp = self.prefix.join("made-from.txt");
+        let requirements = root.join("tests/requirements.txt");
+        let wanted = fs::read_to_string(&requirements)
+            .with_context(|| format!("cannot read {}", requirements.display()))?;
+        // A virtual environment holds absolute paths: one that was moved has to be made again.
+        let recipe = format!("{}\n{wanted}", self.prefix.display());
+        if fs::read_to_string(&stamp).is_ok_and(|text| text == recipe) {
+            println!("python: packages present in {}", self.prefix.display());
+            return Ok(());
+        }
+        let python = for_ros()?;
+        println!(
+            "python: installing ROS 2 for {} into {} ...",
+            python.display(),
+            self.prefix.display()
+        );
+        if self.prefix.exists() {
+            fs::remove_dir_all(&self.prefix)
+                .with_context(|| format!("cannot remove the old {}", self.prefix.display()))?;
+        }
+        output(command(&python).args(["-m", "venv"]).arg(&self.prefix)).context(
+            "cannot make a virtual environment (Debian and Ubuntu: apt install python3-venv)",
+        )?;
+        run(self
+            .python()?
+            .args([
+                "-m",
+                "pip",
+                "install",
+                "--quiet",
+                "--disable-pip-version-check",
+                "-r",
+            ])
+            .arg(&requirements))
+        .context("cannot install the packages of tests/requirements.txt")?;
+        run(self.python()?.arg(root.join("xtask/repair_ros_wheels.py")))?;
+        fs::write(&stamp, recipe).with_context(|| format!("cannot write {}", stamp.display()))
+    }
+
+    /// Builds the ROS package in `msgs/` and installs it into the environment.
+    fn build_messages(&self, root: &Path) -> Result<()> {
+        let stamp = self.prefix.join("messages-made-from.txt");
+        let recipe = message_sources(&root.join("msgs"))?;
+        if fs::read_to_string(&stamp).is_ok_and(|text| text == recipe) {
+            println!("python: sctn_msgs present in {}", self.prefix.display());
+            return Ok(());
+        }
+        println!("python: building sctn_msgs ...");
+        let build = self.prefix.join("build/sctn_msgs");
+        if build.exists() {
+            fs::remove_dir_all(&build)
+                .with_context(|| format!("cannot remove {}", build.display()))?;
+        }
+        let cmake = |arguments: &[&str]| -> Result<String> {
+            // Through Python, so that the environment's CMake runs and no other.
+            output(
+                self.python()?
+                    .args(["-c", "import cmake; cmake.cmake()"])
+                    .args(arguments),
+            )
+        };
+        let (source, build) = (
+            root.join("msgs").display().to_string(),
+            build.display().to_string(),
+        );
+        let prefix = format!("-DCMAKE_INSTALL_PREFIX={}", self.prefix.display());
+        let settings = [
+            "-DBUILD_TESTING=OFF",
+            "-DCMAKE_BUILD_TYPE=Release",
+            "-DPython3_FIND_VIRTUALENV=ONLY",
+        ];
+        let rpath = "-DCMAKE_INSTALL_RPATH=$ORIGIN";
+        cmake(
+            &[
+                &["-S", &source, "-B", &build, "-G", "Ninja", &prefix, rpath],
+                &settings[..],
+            ]
+            .concat(),
+        )
+        .and_then(|_| cmake(&["--build", &build, "--target", "install"]))
+        .context("cannot build the ROS package msgs/ (a C++ compiler is needed)")?;
+        fs::write(&stamp, recipe).with_context(|| format!("cannot write {}", stamp.display()))
+    }
+}
+
+/// A Python that the ROS 2 wheels fit and that can build extension modules.
+fn for_ros() -> Result<PathBuf> {
+    let names = std::iter::once("python3".to_owned())
+        .chain(ROS_MINORS.rev().map(|minor| format!("python3.{minor}")));
+    let mut reasons = String::new();
+    for name in names {
+        match fits_ros(Path::new(&name)) {
+            Ok(()) => return Ok(name.into()),
+            Err(error) => reasons += &format!("\n  {name}: {error:#}"),
+        }
+    }
+    bail!(
+        "the end-to-end tests need Python 3.{} to 3.{} with pip, venv and headers; none was found:{reasons}",
+        ROS_MINORS.start(),
+        ROS_MINORS.end()
+    )
+}
+
+fn fits_ros(python: &Path) -> Result<()> {
+    let minor = minor_version(python).context("does not run")?;
+    ensure!(
+        ROS_MINORS.contains(&minor),
+        "there are no ROS 2 wheels for Python 3.{minor}"
+    );
+    output(command(python).args(["-c", "import ensurepip, venv"]))
+        .context("has no venv (Debian and Ubuntu: apt install python3-venv)")?;
+    let script = "import pathlib, sysconfig; print(pathlib.Path(sysconfig.get_path('include'), 'Python.h').is_file())";
+    ensure!(
+        output(command(python).args(["-c", script]))?.trim() == "True",
+        "has no headers (Debian and Ubuntu: apt install python3-dev)"
+    );
+    Ok(())
+}
+
+/// Everything that the ROS package is built from, as one text: file names and contents.
+fn message_sources(package: &Path) -> Result<String> {
+    let mut text = String::new();
+    let mut add = |path: &Path| -> Result<()> {
+        let contents =
+            fs::read_to_string(path).with_context(|| format!("cannot read {}", path.display()))?;
+        text += &format!("== {}\n{contents}\n", path.display());
+        Ok(())
+    };
+    for file in ["package.xml", "CMakeLists.txt"] {
+        add(&package.join(file))?;
+    }
+    for folder in ["msg", "srv", "action"] {
+        let folder = package.join(folder);
+        if folder.is_dir() {
+            let mut files = fs::read_dir(&folder)?
+                .map(|entry| Ok(entry?.path()))
+                .collect::<Result<Vec<_>>>()?;
+            files.sort();
+            files.iter().try_for_each(|path| add(path))?;
+        }
+    }
+    Ok(text)
 }

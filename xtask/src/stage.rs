@@ -1,0 +1,108 @@
+//! The checks of `cargo xtask test`, in the order in which they run.
+
+use crate::command::{cargo, run};
+use crate::{libtorch, licences, python};
+use anyhow::{Context as _, Result};
+use clap::ValueEnum;
+use std::time::{Duration, Instant};
+
+/// One check.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum Stage {
+    /// The slim libtorch and the Python environment of the end-to-end tests
+    Setup,
+    /// rustfmt would change nothing
+    Fmt,
+    /// Every dependency has a permissive licence
+    Licences,
+    /// clippy has no warning
+    Clippy,
+    /// The documentation builds without a warning
+    Doc,
+    /// Unit tests and documentation examples of every crate
+    Unit,
+    /// Real processes and rclpy: pytest in tests/
+    EndToEnd,
+}
+
+impl Stage {
+    /// Runs the check. Everything is built in release, so that dependencies are compiled once.
+    fn run(self, pytest_arguments: &[String]) -> Result<()> {
+        match self {
+            Self::Setup => {
+                libtorch::set_up(&python::with_pip()?)?;
+                python::Environment::set_up().map(drop)
+            }
+            Self::Fmt => run(cargo().args(["fmt", "--all", "--check"])),
+            Self::Licences => licences::check(),
+            Self::Clippy => run(cargo().args([
+                "clippy",
+                "--workspace",
+                "--all-targets",
+                "--release",
+                "--",
+                "-D",
+                "warnings",
+            ])),
+            Self::Doc => run(cargo()
+                .args(["doc", "--workspace", "--no-deps", "--release"])
+                .env("RUSTDOCFLAGS", "-D warnings")),
+            Self::Unit => run(cargo().args(["test", "--workspace", "--release"])),
+            Self::EndToEnd => {
+                let environment = python::Environment::set_up()?;
+                build_programs()?;
+                run(environment
+                    .python()?
+                    .args(["-m", "pytest", "tests"])
+                    .args(pytest_arguments))
+            }
+        }
+    }
+
+    fn name(self) -> String {
+        self.to_possible_value()
+            .map(|value| value.get_name().to_owned())
+            .unwrap_or_default()
+    }
+}
+
+/// Builds the nodes and the `sctn` command.
+pub fn build_programs() -> Result<()> {
+    run(cargo().args([
+        "build",
+        "--workspace",
+        "--exclude",
+        "xtask",
+        "--bins",
+        "--release",
+    ]))
+}
+
+/// Runs the given checks, or all of them when none is given, and prints how long each took.
+pub fn run_all(only: &[Stage], pytest_arguments: &[String]) -> Result<()> {
+    let mut times: Vec<(Stage, Duration)> = Vec::new();
+    for &stage in Stage::value_variants() {
+        if !only.is_empty() && !only.contains(&stage) {
+            continue;
+        }
+        println!("=== {} ===", stage.name());
+        let start = Instant::now();
+        stage
+            .run(pytest_arguments)
+            .with_context(|| format!("stage {} failed", stage.name()))?;
+        times.push((stage, start.elapsed()));
+    }
+    println!("=== time of each stage ===");
+    for (stage, time) in &times {
+        println!("{:>12} {:7.1} s", stage.name(), time.as_secs_f64());
+    }
+    println!(
+        "{:>12} {:7.1} s",
+        "total",
+        times
+            .iter()
+            .map(|(_, time)| time.as_secs_f64())
+            .sum::<f64>()
+    );
+    Ok(())
+}

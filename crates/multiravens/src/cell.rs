@@ -169,7 +169,7 @@ impl Cell {
     }
 
     /// Present joint positions.
-    pub fn joints(&self) -> Joints {
+    pub fn joint_positions(&self) -> Joints {
         self.joints
     }
 
@@ -199,7 +199,7 @@ impl Cell {
     }
 
     /// Whether the vacuum sensor says that something is held.
-    pub fn holds(&self) -> bool {
+    pub fn is_holding(&self) -> bool {
         self.world.held().is_some()
     }
 
@@ -364,6 +364,183 @@ impl Robot for Cell {
     }
 
     fn holds(&mut self) -> Result<bool, CellError> {
-        Ok(Cell::holds(self))
+        Ok(self.is_holding())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::world::{BodyId, Mobility, Part, Shape};
+    use nalgebra::{Isometry2, Isometry3, Vector2};
+    use ur5::Arm;
+
+    const DISK_HEIGHT_M: f64 = 0.012;
+
+    fn cell() -> Cell {
+        Cell::new(&WorkCell::builtin().unwrap())
+    }
+
+    fn add_disk(cell: &mut Cell, x: f64, y: f64) -> BodyId {
+        cell.world_mut().add(&Part {
+            shape: Shape::Cylinder {
+                radius_m: 0.026,
+                length_m: DISK_HEIGHT_M,
+            },
+            pose: Isometry3::translation(x, y, DISK_HEIGHT_M / 2.0),
+            mobility: Mobility::Free {
+                mass_kg: 0.02,
+                suction_force_n: 5.0,
+            },
+            friction: 0.5,
+            rgb: [255; 3],
+        })
+    }
+
+    fn line(cell: &Cell, x: f64, y: f64, z: f64, speed: f64) -> JointTrajectory {
+        let tip = Arm::tip_down(&Isometry2::new(Vector2::new(x, y), 0.0), z);
+        let arm = &cell.work_cell().arm;
+        JointTrajectory::line(arm, &cell.joint_positions(), &tip, speed, 2.5).unwrap()
+    }
+
+    fn fly(cell: &mut Cell, x: f64, y: f64, z: f64) {
+        let arm = &cell.work_cell().arm;
+        let tip = Arm::tip_down(&Isometry2::new(Vector2::new(x, y), 0.0), z);
+        let to = arm.solve(&tip, &cell.joint_positions()).unwrap();
+        let trajectory = JointTrajectory::joint_space(arm, &cell.joint_positions(), &to).unwrap();
+        assert!(cell.follow(&trajectory).unwrap());
+    }
+
+    fn go_home(cell: &mut Cell) -> JointTrajectory {
+        let arm = &cell.work_cell().arm;
+        JointTrajectory::joint_space(arm, &cell.joint_positions(), &arm.home).unwrap()
+    }
+
+    fn tip_height(cell: &Cell) -> f64 {
+        cell.work_cell()
+            .arm
+            .tip(&cell.joint_positions())
+            .translation
+            .z
+    }
+
+    #[test]
+    fn a_descent_stops_where_the_tip_touches() {
+        let mut cell = cell();
+        fly(&mut cell, 0.5, 0.1, 0.05);
+        let down = line(&cell, 0.5, 0.1, -0.02, 0.1);
+        assert!(cell.follow_until_contact(&down).unwrap());
+        assert!(tip_height(&cell).abs() < 1e-3, "{}", tip_height(&cell));
+        // The table cannot be gripped.
+        cell.set_suction(true);
+        assert!(!cell.is_holding());
+    }
+
+    #[test]
+    fn a_descent_above_the_table_meets_nothing() {
+        let mut cell = cell();
+        fly(&mut cell, 0.5, 0.1, 0.05);
+        let down = line(&cell, 0.5, 0.1, 0.005, 0.1);
+        assert!(!cell.follow_until_contact(&down).unwrap());
+    }
+
+    #[test]
+    fn a_disk_is_carried_and_set_down() {
+        let mut cell = cell();
+        let disk = add_disk(&mut cell, 0.5, 0.1);
+        assert!(cell.settle().unwrap());
+        fly(&mut cell, 0.51, 0.1, 0.05);
+        let down = line(&cell, 0.51, 0.1, -0.02, 0.1);
+        assert!(cell.follow_until_contact(&down).unwrap());
+        assert!((tip_height(&cell) - DISK_HEIGHT_M).abs() < 1e-3);
+        cell.set_suction(true);
+        assert!(cell.is_holding());
+        for (x, y, z) in [(0.51, 0.1, 0.08), (0.4, -0.2, 0.08)] {
+            let to = line(&cell, x, y, z, 0.5);
+            assert!(cell.follow(&to).unwrap());
+        }
+        assert!(cell.world().position(disk).z > 0.05);
+        let down = line(&cell, 0.4, -0.2, -0.02, 0.1);
+        assert!(cell.follow_until_contact(&down).unwrap());
+        cell.set_suction(false);
+        assert!(!cell.is_holding());
+        let up = line(&cell, 0.4, -0.2, 0.08, 0.5);
+        assert!(cell.follow(&up).unwrap());
+        assert!(!cell.is_settled());
+        let home = go_home(&mut cell);
+        assert!(cell.follow(&home).unwrap());
+        assert!(cell.is_home() && cell.is_settled());
+        let off = cell.world().position(disk) - nalgebra::Point3::new(0.39, -0.2, 0.006);
+        assert!(off.norm() < 1e-3, "{off}");
+    }
+
+    #[test]
+    fn pressing_into_the_table_stops_by_the_lag_rule() {
+        let mut cell = cell();
+        fly(&mut cell, 0.5, 0.1, 0.05);
+        let down = line(&cell, 0.5, 0.1, -0.05, 0.1);
+        assert!(!cell.follow(&down).unwrap());
+        assert!((tip_height(&cell) + MAX_LAG_M).abs() < 2e-3);
+    }
+
+    #[test]
+    fn ticks_and_whole_motions_give_the_same_bits() {
+        let scene = || {
+            let mut cell = cell();
+            add_disk(&mut cell, 0.5, 0.1);
+            cell.settle().unwrap();
+            cell
+        };
+        let (mut whole, mut ticked) = (scene(), scene());
+        let arm = whole.work_cell().arm.clone();
+        let tip = Arm::tip_down(&Isometry2::new(Vector2::new(0.47, 0.1), 0.0), 0.006);
+        let to = arm.solve(&tip, &arm.home).unwrap();
+        // Sweeps the disk aside.
+        let out = JointTrajectory::joint_space(&arm, &arm.home, &to).unwrap();
+        let back = JointTrajectory::joint_space(&arm, &to, &arm.home).unwrap();
+        for trajectory in [&out, &back] {
+            whole.follow(trajectory).unwrap();
+            ticked.begin(trajectory.clone(), false).unwrap();
+            let mut ticks = 0;
+            while ticked.tick().unwrap() == Tick::Moving {
+                ticks += 1;
+            }
+            assert!(ticks > 100);
+            assert_eq!(ticked.tick().unwrap(), Tick::Idle);
+            assert_eq!(whole.time(), ticked.time());
+            assert_eq!(whole.joint_positions(), ticked.joint_positions());
+            assert_eq!(whole.world().state_hash(), ticked.world().state_hash());
+        }
+        assert!(whole.is_settled() && ticked.is_settled());
+    }
+
+    #[test]
+    fn only_one_motion_at_a_time_and_only_from_where_the_arm_is() {
+        let mut cell = cell();
+        let arm = cell.work_cell().arm.clone();
+        let away = arm.home + Joints::repeat(0.2);
+        let there = JointTrajectory::joint_space(&arm, &away, &arm.home).unwrap();
+        assert!(matches!(
+            cell.begin(there, false),
+            Err(CellError::Jump { .. })
+        ));
+        let out = JointTrajectory::joint_space(&arm, &arm.home, &away).unwrap();
+        cell.begin(out.clone(), false).unwrap();
+        cell.tick().unwrap();
+        assert_eq!(cell.begin(out, false), Err(CellError::Busy));
+        assert_eq!(cell.settle(), Err(CellError::Busy));
+        assert!(cell.cancel() && !cell.cancel());
+        assert_eq!(cell.tick(), Ok(Tick::Idle));
+    }
+
+    #[test]
+    fn simulated_time_stands_still_between_motions() {
+        let mut cell = cell();
+        cell.settle().unwrap();
+        let time = cell.time();
+        cell.set_suction(true);
+        cell.render().unwrap();
+        assert_eq!(cell.tick(), Ok(Tick::Idle));
+        assert_eq!(cell.time(), time);
     }
 }

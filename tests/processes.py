@@ -1,0 +1,124 @@
+"""Starts our executables for a test and ends them by process id, leaving nothing behind."""
+
+from __future__ import annotations
+
+import os
+import pathlib
+import signal
+import socket
+import subprocess
+import time
+
+REPOSITORY = pathlib.Path(__file__).resolve().parent.parent
+BINARIES = REPOSITORY / os.environ.get("CARGO_TARGET_DIR", "target") / "release"
+
+# How long a process may take to end after SIGTERM.
+GRACE_S = 10.0
+
+
+def free_domain() -> int:
+    """A ROS domain id whose discovery ports nobody on this machine has.
+
+    Ids above 100 would use ports that the kernel hands out to others.
+    """
+    start = os.getpid() + free_domain.calls
+    free_domain.calls += 1
+    for offset in range(100):
+        domain = 1 + (start + offset) % 100
+        ports = [7400 + 250 * domain + port for port in (0, 1, *range(10, 34))]
+        if all(_is_free(port) for port in ports):
+            return domain
+    raise RuntimeError("no free ROS domain id between 1 and 100")
+
+
+free_domain.calls = 0
+
+
+def _is_free(port: int) -> bool:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.bind(("0.0.0.0", port))
+        except OSError:
+            return False
+    return True
+
+
+def environment(domain: int) -> dict[str, str]:
+    """The environment of a node under test: its own domain, this machine only."""
+    return {
+        **{name: value for name, value in os.environ.items() if not name.startswith(("ROS_", "RMW_"))},
+        "ROS_DOMAIN_ID": str(domain),
+        "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+        "RUST_BACKTRACE": "0",
+        "NO_COLOR": "1",
+    }
+
+
+class Process:
+    """One running executable with its output in a file."""
+
+    def __init__(self, name: str, arguments: list[str], domain: int, log_directory: pathlib.Path) -> None:
+        self.name = name
+        executable = BINARIES / name
+        if not executable.exists():
+            raise FileNotFoundError(f"{executable}: build first, `cargo build --release --workspace --bins`")
+        number = len(list(log_directory.glob(f"{name}*.log")))
+        self.log_file = log_directory / f"{name}-{number}.log"
+        with self.log_file.open("wb") as log:
+            # Its own session: whatever it starts can be found and ended with it.
+            self._child = subprocess.Popen(
+                [executable, *map(str, arguments)],
+                cwd=REPOSITORY,
+                env=environment(domain),
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=subprocess.STDOUT,
+                start_new_session=True,
+            )
+
+    @property
+    def pid(self) -> int:
+        return self._child.pid
+
+    @property
+    def exit_code(self) -> int | None:
+        return self._child.poll()
+
+    def log(self) -> str:
+        return self.log_file.read_text(errors="replace")
+
+    def wait(self, timeout_s: float) -> int:
+        """The exit code; an error with the end of the log when it is still running after the time."""
+        try:
+            return self._child.wait(timeout_s)
+        except subprocess.TimeoutExpired:
+            raise TimeoutError(f"{self.name} still runs after {timeout_s} s; its log ends:\n{self.log()[-3000:]}") from None
+
+    def descendants(self) -> list[int]:
+        """Living processes of its session, itself included; zombies do not count."""
+        found = []
+        for entry in pathlib.Path("/proc").iterdir():
+            if not entry.name.isdigit():
+                continue
+            try:
+                fields = (entry / "stat").read_text().rsplit(")", 1)[1].split()
+            except OSError:
+                continue
+            state, session = fields[0], int(fields[3])
+            if session == self.pid and state != "Z":
+                found.append(int(entry.name))
+        return found
+
+    def end(self) -> None:
+        """Asks it to end, and kills what is left of its session after the grace time."""
+        if self.exit_code is None:
+            self._child.send_signal(signal.SIGTERM)
+        deadline = time.monotonic() + GRACE_S
+        while (self.exit_code is None or self.descendants()) and time.monotonic() < deadline:
+            time.sleep(0.05)
+        for pid in self.descendants():
+            try:
+                os.kill(pid, signal.SIGKILL)
+            except ProcessLookupError:
+                pass
+        self._child.wait(GRACE_S)

@@ -1,0 +1,101 @@
+"""A Python operator carries a whole run of placing through, by topic only."""
+
+from __future__ import annotations
+
+import numpy as np
+from sctn_msgs.msg import Goal, Heightmap, PickPlace, StepConfirmation, StepResult
+
+from cell_operator import Operator, nanoseconds
+
+NODES = {"camera_fusion", "goal_oracle", "gctn_policy", "suction_executor", "sim_workcell"}
+DISKS = 9
+
+# Each step may be tried again a few times: the policy is learned. The run has to end all the same.
+MOST_PROPOSALS = 3 * DISKS
+
+
+def test_an_operator_in_python_sees_the_graph_and_places_all_nine_disks(start, operator: Operator) -> None:
+    launch = start("sctn", "launch", "--problem", "placing", "--seed", 10000, "--operator", "none", "--processes")
+
+    operator.until(lambda: NODES <= {name for name, _ in operator.node.get_node_names_and_namespaces()}, "full graph", 60.0)
+    check_heightmap(operator.next("heightmap"))
+    goal = operator.next("goal")
+    assert (goal.problem, goal.step, goal.step_count, goal.attempt, goal.complete) == ("placing", 1, DISKS, 0, False)
+    check_heightmap(goal.heightmap)
+
+    # The first proposal is rejected: nothing moves, and another one is made.
+    first = next_proposal(operator, goal)
+    rejected = operator.count("step_result")
+    operator.confirm(first.id, StepConfirmation.REJECT)
+    result = operator.next("step_result", rejected)
+    assert (result.proposal_id, result.outcome) == (first.id, StepResult.REJECTED)
+    goal = next_goal(operator, step=1, attempt=1)
+    proposal = next_proposal(operator, goal)
+    assert proposal.id != first.id
+    assert (proposal.pick.x, proposal.pick.y) != (first.pick.x, first.pick.y)
+
+    total, steps_done = 0.0, 0
+    for _ in range(MOST_PROPOSALS):
+        rewards = operator.count("reward")
+        result = operator.approve(proposal)
+        assert nanoseconds(result.duration) > 0, result.reason
+        reward = operator.next("reward", rewards)
+        total = reward.total
+        if reward.delta > 0:
+            steps_done += 1
+            operator.confirm(proposal.id, StepConfirmation.ADVANCE)
+            step, attempt = goal.step + 1, 0
+        else:
+            operator.confirm(proposal.id, StepConfirmation.RETRY)
+            step, attempt = goal.step, goal.attempt + 1
+        if reward.complete:
+            break
+        goal = next_goal(operator, step, attempt)
+        proposal = next_proposal(operator, goal)
+
+    assert steps_done == DISKS
+    assert np.isclose(total, 1.0)
+    last = operator.next("goal", accept=lambda message: message.complete)
+    assert last.step == DISKS
+    assert launch.wait(30.0) == 0, launch.log()
+    assert launch.descendants() == []
+
+
+def test_a_late_joiner_gets_the_latched_heightmap_and_goal(start, operator: Operator, domain: int) -> None:
+    start("sctn", "launch", "--problem", "placing", "--seed", 10002, "--operator", "none", "--processes")
+    goal = operator.next("goal", timeout_s=90.0)
+    heightmap = operator.next("heightmap")
+    with Operator(domain, "late_operator") as late:
+        assert late.next("goal") == goal
+        # Fusion goes on: the newest one comes, of the same scene.
+        assert np.allclose(heights(late.next("heightmap")), heights(heightmap), atol=1e-3)
+
+
+def check_heightmap(heightmap: Heightmap) -> None:
+    """Sizes agree with each other and the workspace was seen."""
+    cells = heightmap.rows * heightmap.cols
+    assert (heightmap.rows, heightmap.cols) == (320, 160)
+    assert len(heightmap.rgb) == 3 * cells
+    assert len(heightmap.height_m) == cells
+    assert heightmap.header.frame_id == "world"
+    assert heightmap.coverage > 0.95
+    assert np.isfinite(heights(heightmap)).all()
+    assert 0.002 < heights(heightmap).max() < 0.3
+
+
+def heights(heightmap: Heightmap) -> np.ndarray:
+    """Height of each cell [m]."""
+    return np.asarray(heightmap.height_m).reshape(heightmap.rows, heightmap.cols)
+
+
+def next_goal(operator: Operator, step: int, attempt: int) -> Goal:
+    """The goal of a step and attempt."""
+    return operator.next("goal", accept=lambda goal: (goal.step, goal.attempt) == (step, attempt))
+
+
+def next_proposal(operator: Operator, goal: Goal) -> PickPlace:
+    """The proposal for a goal, made from an observation that is not older than the goal."""
+    proposal = operator.next("pick_place", accept=lambda made: (made.step, made.attempt) == (goal.step, goal.attempt))
+    assert nanoseconds(proposal.header.stamp) >= nanoseconds(goal.header.stamp)
+    assert proposal.settings == goal.settings
+    return proposal

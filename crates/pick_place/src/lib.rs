@@ -1,5 +1,9 @@
 //! The suction pick-and-place primitive as a state machine over a small robot trait.
 
 mod primitive;
+mod robot;
+mod settings;
 
-pub use primitive::{Outcome, Phase, PickPlace, PrimitiveSettings, Robot, execute};
+pub use primitive::{Command, Next, Outcome, Phase, PickPlace, Primitive, PrimitiveError, Report};
+pub use robot::{ExecuteError, Robot, execute};
+pub use settings::{PrimitiveSettings, SettingsError};

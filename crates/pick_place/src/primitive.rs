@@ -1,8 +1,9 @@
-//! The primitive.
+//! The primitive as a state machine: reports in, commands out, no robot inside.
 
-use nalgebra::Isometry2;
+use crate::{PrimitiveSettings, SettingsError};
+use nalgebra::{Isometry2, Isometry3};
 use serde::{Deserialize, Serialize};
-use ur5::{Arm, JointTrajectory, Joints};
+use ur5::{Arm, JointTrajectory, Joints, PlanError, Unreachable};
 
 /// An action: where the end effector grasps and where it releases, in the world's xy-plane
 /// (paper, section III-A).
@@ -12,24 +13,6 @@ pub struct PickPlace {
     pub pick: Isometry2<f64>,
     /// Pose at which to release.
     pub place: Isometry2<f64>,
-}
-
-/// Heights and speeds of the primitive; they change with the task module (Ravens).
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(deny_unknown_fields)]
-pub struct PrimitiveSettings {
-    /// Height of approach and retreat over the table.
-    pub clearance_m: f64,
-    /// Height over the contact at which a held object travels.
-    pub lift_m: f64,
-    /// Tip speed in free motion.
-    pub travel_m_s: f64,
-    /// Tip speed while it holds something.
-    pub carry_m_s: f64,
-    /// Tip speed while it descends to contact.
-    pub descend_m_s: f64,
-    /// Tip acceleration.
-    pub acceleration_m_s2: f64,
 }
 
 /// Where the primitive stands.
@@ -63,29 +46,385 @@ pub enum Outcome {
     LagAborted,
 }
 
-/// The robot as the UR driver shows it: joint trajectories, move until contact, suction.
-pub trait Robot {
-    /// Why the robot could not do what it was told (driver fault, protective stop, lost connection).
-    type Error;
-    /// Present joint positions.
-    fn joints(&mut self) -> Result<Joints, Self::Error>;
-    /// Follows a trajectory to its end. `false`: stopped half-way by the lag rule.
-    fn follow(&mut self, trajectory: &JointTrajectory) -> Result<bool, Self::Error>;
-    /// Follows a trajectory until the tool touches something. `false`: no contact up to its end.
-    fn follow_until_contact(&mut self, trajectory: &JointTrajectory) -> Result<bool, Self::Error>;
-    /// Switches suction.
-    fn set_suction(&mut self, on: bool) -> Result<(), Self::Error>;
-    /// Whether the vacuum sensor says that something is held.
-    fn holds(&mut self) -> Result<bool, Self::Error>;
+/// What the robot shall do next.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Command {
+    /// Follow to the end. Answered by [`Report::Arrived`] or [`Report::Lagged`].
+    Follow(JointTrajectory),
+    /// Follow until the tool touches something. Answered by [`Report::Contact`] or
+    /// [`Report::NoContact`].
+    FollowUntilContact(JointTrajectory),
+    /// Switch suction. Answered by [`Report::SuctionSet`].
+    SetSuction(bool),
+    /// Read the vacuum sensor. Answered by [`Report::Holds`].
+    ReadVacuum,
 }
 
-/// Carries out one pick and place; `observe` is told each phase as it begins.
-pub fn execute<R: Robot>(
-    _robot: &mut R,
-    _arm: &Arm,
-    _action: &PickPlace,
-    _settings: &PrimitiveSettings,
-    _observe: impl FnMut(Phase),
-) -> Result<Outcome, R::Error> {
-    todo!()
+/// What the robot did; joint positions are those where it came to rest.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Report {
+    /// The trajectory ended.
+    Arrived(Joints),
+    /// The lag rule stopped the motion half-way.
+    Lagged(Joints),
+    /// The tool touched something and the motion stopped.
+    Contact(Joints),
+    /// The trajectory ended without contact.
+    NoContact(Joints),
+    /// Suction is switched.
+    SuctionSet,
+    /// Whether something is held.
+    Holds(bool),
+}
+
+/// What comes after a report.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Next {
+    /// Go on with this.
+    Do(Command),
+    /// The primitive has ended, the arm is home.
+    Done(Outcome),
+}
+
+/// Why a primitive cannot start or go on. Nothing must move after one.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+pub enum PrimitiveError {
+    /// A setting is out of range.
+    #[error(transparent)]
+    Settings(#[from] SettingsError),
+    /// A pose has a coordinate that is not finite.
+    #[error("the {which} pose is not finite")]
+    NotFinite {
+        /// Pick or place.
+        which: &'static str,
+    },
+    /// A pose that the arm cannot work at.
+    #[error("the {which} pose is out of reach: {reason}")]
+    OutOfReach {
+        /// Pick or place.
+        which: &'static str,
+        /// What cannot be reached.
+        reason: Unreachable,
+    },
+    /// A motion cannot be planned.
+    #[error("{phase:?}: {reason}")]
+    Plan {
+        /// Where the primitive stood.
+        phase: Phase,
+        /// Why.
+        reason: PlanError,
+    },
+    /// Suction already holds something.
+    #[error("the gripper already holds something, expected it to be empty")]
+    AlreadyHolding,
+    /// The arm lagged behind with nothing held: something is in its way.
+    #[error("{phase:?}: the arm lags behind although it holds nothing, something is in its way")]
+    Blocked {
+        /// Where the primitive stood.
+        phase: Phase,
+    },
+    /// A report that does not answer the last command.
+    #[error("{phase:?}: {report:?} does not answer the last command")]
+    UnexpectedReport {
+        /// Where the primitive stood.
+        phase: Phase,
+        /// What came.
+        report: Report,
+    },
+}
+
+/// A descent ends here when it meets nothing: a little below the table's top.
+const LOWEST_M: f64 = -0.01;
+/// The arm must be able to rise to this height over a pose to work there.
+const LEAST_RISE_M: f64 = 0.05;
+/// The arm keeps this far below its highest point over a pose, where it would be stretched out.
+const STRETCH_MARGIN_M: f64 = 0.005;
+
+/// One pick and place. Ask [`Self::start`] once, then [`Self::next`] with each report.
+///
+/// Approach and way home are straight in joint space, everything between is straight lines of the
+/// tip, which points down all the time. Over the far corners of the workspace the arm cannot rise
+/// to the clearance: there it works as high as it can.
+#[derive(Clone, Debug)]
+pub struct Primitive<'a> {
+    arm: &'a Arm,
+    /// Where to grasp and release, with the yaw of the tip there.
+    pick: Isometry2<f64>,
+    place: Isometry2<f64>,
+    settings: PrimitiveSettings,
+    /// Highest that the arm shall go over pick and place.
+    ceiling_m: (f64, f64),
+    phase: Phase,
+    /// Whether the approach's last motion, the one to above the pick, has begun.
+    approaching: bool,
+    /// Where the arm is, as last reported.
+    joints: Joints,
+    /// Height of the transfer, known since the contact.
+    carry_m: f64,
+    outcome: Outcome,
+}
+
+impl<'a> Primitive<'a> {
+    /// Checks settings and reach before anything moves. `joints` is where the arm is.
+    ///
+    /// # Errors
+    /// When a setting or pose cannot be worked with.
+    pub fn new(
+        arm: &'a Arm,
+        action: &PickPlace,
+        settings: &PrimitiveSettings,
+        joints: &Joints,
+    ) -> Result<Self, PrimitiveError> {
+        settings.check()?;
+        let ceiling = |which, pose: &Isometry2<f64>, wanted_m: f64| {
+            let values = [
+                pose.translation.x,
+                pose.translation.y,
+                pose.rotation.re,
+                pose.rotation.im,
+            ];
+            if !values.iter().all(|value| value.is_finite()) {
+                return Err(PrimitiveError::NotFinite { which });
+            }
+            ceiling_m(arm, pose, wanted_m)
+                .map_err(|reason| PrimitiveError::OutOfReach { which, reason })
+        };
+        // The object may stand on others: as high as lift and clearance together could ask for.
+        let wanted_m = settings.clearance_m + settings.lift_m;
+        let pick = ceiling("pick", &action.pick, wanted_m)?;
+        let place = ceiling("place", &action.place, wanted_m)?;
+        // The cup is round: only the turn from pick to place counts. Half of it before and half
+        // after keeps wrist 3 away from its limits.
+        let half_turn = 0.5 * action.pick.rotation.angle_to(&action.place.rotation);
+        let turned =
+            |pose: &Isometry2<f64>, yaw_rad| Isometry2::new(pose.translation.vector, yaw_rad);
+        Ok(Self {
+            arm,
+            pick: turned(&action.pick, -half_turn),
+            place: turned(&action.place, half_turn),
+            settings: *settings,
+            ceiling_m: (pick, place),
+            phase: Phase::Approach,
+            approaching: false,
+            joints: *joints,
+            carry_m: settings.lift_m,
+            outcome: Outcome::Placed,
+        })
+    }
+
+    /// Where the primitive stands.
+    pub fn phase(&self) -> Phase {
+        self.phase
+    }
+
+    /// The first command.
+    pub fn start(&self) -> Command {
+        Command::ReadVacuum
+    }
+
+    /// The command after a report.
+    ///
+    /// # Errors
+    /// When the primitive cannot go on; nothing must move then.
+    pub fn next(&mut self, report: Report) -> Result<Next, PrimitiveError> {
+        if let Report::Arrived(joints)
+        | Report::Lagged(joints)
+        | Report::Contact(joints)
+        | Report::NoContact(joints) = report
+        {
+            self.joints = joints;
+        }
+        let command = match (self.phase, report) {
+            (Phase::Approach, Report::Holds(true)) => return Err(PrimitiveError::AlreadyHolding),
+            (Phase::Approach, Report::Holds(false)) => match self.rise()? {
+                Some(rise) => rise,
+                None => self.approach()?,
+            },
+            (Phase::Approach, Report::Arrived(_)) if !self.approaching => self.approach()?,
+            (Phase::Approach, Report::Arrived(_)) => {
+                self.phase = Phase::DescendToPick;
+                self.descend(&self.pick)?
+            }
+            (Phase::DescendToPick, Report::Contact(_)) => {
+                self.phase = Phase::Grasp;
+                Command::SetSuction(true)
+            }
+            (Phase::DescendToPick, Report::NoContact(_)) => {
+                self.outcome = Outcome::NoContact;
+                self.retreat()?
+            }
+            (Phase::Grasp, Report::SuctionSet) => {
+                self.phase = Phase::Lift;
+                let contact_m = self.arm.tip(&self.joints).translation.z;
+                self.carry_m = contact_m + self.settings.lift_m;
+                let height_m = self.carry_m.min(self.ceiling_m.0);
+                self.line(
+                    &Arm::tip_down(&self.pick, height_m),
+                    self.settings.carry_m_s,
+                )?
+            }
+            (Phase::Lift, Report::Arrived(_)) => {
+                self.phase = Phase::CheckGrasp;
+                Command::ReadVacuum
+            }
+            (Phase::CheckGrasp, Report::Holds(true)) => {
+                self.phase = Phase::Transfer;
+                let height_m = self.carry_m.min(self.ceiling_m.1);
+                self.line(
+                    &Arm::tip_down(&self.place, height_m),
+                    self.settings.carry_m_s,
+                )?
+            }
+            (Phase::CheckGrasp, Report::Holds(false)) => self.give_up(Outcome::GraspFailed),
+            (Phase::Transfer, Report::Arrived(_)) => Command::ReadVacuum,
+            (Phase::Transfer, Report::Holds(true)) => {
+                self.phase = Phase::DescendToPlace;
+                self.descend(&self.place)?
+            }
+            (Phase::DescendToPlace, Report::Contact(_) | Report::NoContact(_)) => {
+                self.phase = Phase::Release;
+                Command::ReadVacuum
+            }
+            (Phase::Transfer | Phase::Release, Report::Holds(false)) => {
+                self.give_up(Outcome::Dropped)
+            }
+            (Phase::Release, Report::Holds(true)) => Command::SetSuction(false),
+            (Phase::Release, Report::SuctionSet) => self.retreat()?,
+            (Phase::Retreat, Report::Arrived(_)) => self.go_home()?,
+            (Phase::Home, Report::Arrived(_)) => return Ok(Next::Done(self.outcome)),
+            (Phase::Approach | Phase::Lift | Phase::Transfer, Report::Lagged(_)) => {
+                self.give_up(Outcome::LagAborted)
+            }
+            (phase @ (Phase::Retreat | Phase::Home), Report::Lagged(_)) => {
+                return Err(PrimitiveError::Blocked { phase });
+            }
+            (phase, report) => return Err(PrimitiveError::UnexpectedReport { phase, report }),
+        };
+        Ok(Next::Do(command))
+    }
+
+    /// Lets go and heads home.
+    fn give_up(&mut self, outcome: Outcome) -> Command {
+        self.outcome = outcome;
+        self.phase = Phase::Release;
+        Command::SetSuction(false)
+    }
+
+    /// Tip pose from which to descend to the pick.
+    fn over_pick(&self) -> Isometry3<f64> {
+        Arm::tip_down(&self.pick, self.settings.clearance_m.min(self.ceiling_m.0))
+    }
+
+    /// Straight through joint space to above the pick.
+    fn approach(&mut self) -> Result<Command, PrimitiveError> {
+        self.approaching = true;
+        let above = self
+            .arm
+            .solve(&self.over_pick(), &self.arm.ready)
+            .map_err(|reason| self.plan_error(reason.into()))?;
+        self.joint_space(&above)
+    }
+
+    fn descend(&self, pose: &Isometry2<f64>) -> Result<Command, PrimitiveError> {
+        let to = Arm::tip_down(pose, LOWEST_M);
+        self.plan_line(&to, self.settings.descend_m_s)
+            .map(Command::FollowUntilContact)
+    }
+
+    fn retreat(&mut self) -> Result<Command, PrimitiveError> {
+        self.phase = Phase::Retreat;
+        match self.rise()? {
+            Some(rise) => Ok(rise),
+            None => self.go_home(),
+        }
+    }
+
+    fn go_home(&mut self) -> Result<Command, PrimitiveError> {
+        self.phase = Phase::Home;
+        self.joint_space(&self.arm.home)
+    }
+
+    /// Straight up to the clearance, or as far as the arm reaches; none when it is there.
+    fn rise(&self) -> Result<Option<Command>, PrimitiveError> {
+        let tip = self.arm.tip(&self.joints);
+        let Some(height_m) = rise_to_m(self.arm, &tip, self.settings.clearance_m, &self.joints)
+        else {
+            return Ok(None);
+        };
+        let mut to = tip;
+        to.translation.z = height_m;
+        self.line(&to, self.settings.travel_m_s).map(Some)
+    }
+
+    fn line(&self, to: &Isometry3<f64>, speed_m_s: f64) -> Result<Command, PrimitiveError> {
+        self.plan_line(to, speed_m_s).map(Command::Follow)
+    }
+
+    fn plan_line(
+        &self,
+        to: &Isometry3<f64>,
+        speed_m_s: f64,
+    ) -> Result<JointTrajectory, PrimitiveError> {
+        JointTrajectory::line(
+            self.arm,
+            &self.joints,
+            to,
+            speed_m_s,
+            self.settings.acceleration_m_s2,
+        )
+        .map_err(|reason| self.plan_error(reason))
+    }
+
+    fn joint_space(&self, to: &Joints) -> Result<Command, PrimitiveError> {
+        JointTrajectory::joint_space_within(self.arm, &self.joints, to, self.settings.travel_m_s)
+            .map(Command::Follow)
+            .map_err(|reason| self.plan_error(reason))
+    }
+
+    fn plan_error(&self, reason: PlanError) -> PrimitiveError {
+        PrimitiveError::Plan {
+            phase: self.phase,
+            reason,
+        }
+    }
+}
+
+/// The highest that the tip can go over a pose, at most `wanted_m`.
+fn ceiling_m(arm: &Arm, pose: &Isometry2<f64>, wanted_m: f64) -> Result<f64, Unreachable> {
+    arm.solve(&Arm::tip_down(pose, LOWEST_M), &arm.ready)?;
+    let least = Arm::tip_down(pose, LEAST_RISE_M + STRETCH_MARGIN_M);
+    arm.solve(&least, &arm.ready)?;
+    Ok(highest_m(arm, &least, wanted_m, &arm.ready))
+}
+
+/// The highest, up to `wanted_m`, that a tip pose can be lifted to, less the margin. The heights
+/// at which the arm reaches a vertical line with the tool down are one interval.
+fn highest_m(arm: &Arm, tip: &Isometry3<f64>, wanted_m: f64, near: &Joints) -> f64 {
+    let reaches = |height_m: f64| {
+        let mut raised = *tip;
+        raised.translation.z = height_m;
+        arm.solve(&raised, near).is_ok()
+    };
+    if reaches(wanted_m + STRETCH_MARGIN_M) {
+        return wanted_m;
+    }
+    let (mut low, mut high) = (tip.translation.z, wanted_m + STRETCH_MARGIN_M);
+    for _ in 0..20 {
+        let middle = 0.5 * (low + high);
+        if reaches(middle) {
+            low = middle;
+        } else {
+            high = middle;
+        }
+    }
+    low - STRETCH_MARGIN_M
+}
+
+/// The height to rise to before anything else, if the tip is lower than it could and should be.
+fn rise_to_m(arm: &Arm, tip: &Isometry3<f64>, clearance_m: f64, joints: &Joints) -> Option<f64> {
+    if tip.translation.z >= clearance_m {
+        return None;
+    }
+    let height_m = highest_m(arm, tip, clearance_m, joints);
+    (height_m > tip.translation.z).then_some(height_m)
 }

@@ -71,6 +71,9 @@ pub struct Arm {
     pub max_speed_rad_s: Joints,
     /// Where the arm rests, out of the cameras' sight.
     pub home: Joints,
+    /// Over the middle of the workspace, elbow up, tool down. The solutions nearest to it cover
+    /// the workspace without a change of posture.
+    pub ready: Joints,
 }
 
 /// Up to eight joint positions.
@@ -89,6 +92,9 @@ impl std::ops::Deref for Solutions {
 
 /// How far, in m, a pose may lie outside the reach and still count as fully stretched: rounding.
 const REACH_ROUNDING_M: f64 = 1e-10;
+/// What wrist 3 counts in the distance between joint positions. Turning it moves nothing but the
+/// tip about itself; at full weight a turn would be traded for another posture of the whole arm.
+const WRIST_3_WEIGHT: f64 = 0.1;
 /// Sine of wrist 2 below which the axes of wrist 1 and wrist 3 count as parallel.
 const WRIST_SINGULAR: f64 = 1e-9;
 
@@ -210,8 +216,8 @@ impl Arm {
         solutions
     }
 
-    /// The joint position within limits nearest to `near` (least squares over the joints, whole
-    /// turns included) that puts the tip at `tip`.
+    /// The joint position within limits nearest to `near` that puts the tip at `tip`: least squares
+    /// over the joints, whole turns included, wrist 3 counting a tenth.
     ///
     /// # Errors
     /// When there is none, or the pose or `near` is not finite.
@@ -221,7 +227,8 @@ impl Arm {
             let Some(joints) = self.unwrap_near(solution, near) else {
                 continue;
             };
-            let distance = (joints - near).norm_squared();
+            let way = joints - near;
+            let distance = way.fixed_rows::<5>(0).norm_squared() + WRIST_3_WEIGHT * way[5].powi(2);
             if best.is_none_or(|(least, _)| distance < least) && distance.is_finite() {
                 best = Some((distance, joints));
             }

@@ -82,7 +82,9 @@ pub enum WorkCellError {
 
 /// Where the arm rests: folded back over its own base, tool down, outside every line of sight
 /// from the cameras to the workspace.
-const HOME_DEG: [f64; 6] = [0.0, -160.0, 120.0, -50.0, -90.0, 0.0];
+const HOME_DEG: [f64; 6] = [0.0, -160.0, 120.0, -50.0, -90.0, -90.0];
+/// Over the middle of the workspace, elbow up, tool down.
+const READY_DEG: [f64; 6] = [-13.0, -80.0, 105.0, -115.0, -90.0, -103.0];
 /// How far, in m and rad, a joint's frame may be off a UR arm's.
 const FRAME_TOLERANCE: f64 = 1e-6;
 
@@ -398,6 +400,7 @@ fn read_arm<'a>(tree: &Tree<'a>, arm_joints: &[&'a urdf_rs::Joint; 6]) -> Result
         limits_rad,
         max_speed_rad_s,
         home: Joints::from(HOME_DEG).map(f64::to_radians),
+        ready: Joints::from(READY_DEG).map(f64::to_radians),
     };
     if !arm.within_limits(&arm.home) {
         return Err(format!(

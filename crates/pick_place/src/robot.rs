@@ -1,0 +1,88 @@
+//! The robot as the primitive sees it.
+
+use crate::primitive::{Command, Next, Primitive};
+use crate::{Outcome, Phase, PickPlace, PrimitiveError, PrimitiveSettings, Report};
+use ur5::{Arm, JointTrajectory, Joints};
+
+/// The robot as the UR driver shows it: joint trajectories, move until contact, suction.
+pub trait Robot {
+    /// Why the robot could not do what it was told (driver fault, protective stop, lost connection).
+    type Error;
+    /// Present joint positions.
+    fn joints(&mut self) -> Result<Joints, Self::Error>;
+    /// Follows a trajectory to its end. `false`: stopped half-way by the lag rule.
+    fn follow(&mut self, trajectory: &JointTrajectory) -> Result<bool, Self::Error>;
+    /// Follows a trajectory until the tool touches something. `false`: no contact up to its end.
+    fn follow_until_contact(&mut self, trajectory: &JointTrajectory) -> Result<bool, Self::Error>;
+    /// Switches suction.
+    fn set_suction(&mut self, on: bool) -> Result<(), Self::Error>;
+    /// Whether the vacuum sensor says that something is held.
+    fn holds(&mut self) -> Result<bool, Self::Error>;
+}
+
+/// Why a primitive broke off. The arm is where it was; suction is as it was, because holding is
+/// safer than dropping.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+pub enum ExecuteError<E> {
+    /// The primitive cannot start or go on.
+    #[error(transparent)]
+    Primitive(#[from] PrimitiveError),
+    /// The robot did not do what it was told.
+    #[error("{phase:?}: {error}")]
+    Robot {
+        /// Where the primitive stood.
+        phase: Phase,
+        /// What the robot said.
+        error: E,
+    },
+}
+
+/// Carries out one pick and place; `observe` is told each phase as it begins.
+///
+/// # Errors
+/// Returns at once, without another command to the robot.
+pub fn execute<R: Robot>(
+    robot: &mut R,
+    arm: &Arm,
+    action: &PickPlace,
+    settings: &PrimitiveSettings,
+    mut observe: impl FnMut(Phase),
+) -> Result<Outcome, ExecuteError<R::Error>> {
+    let mut phase = Phase::Approach;
+    let joints = robot
+        .joints()
+        .map_err(|error| ExecuteError::Robot { phase, error })?;
+    let mut primitive = Primitive::new(arm, action, settings, &joints)?;
+    observe(phase);
+    let mut command = primitive.start();
+    loop {
+        let report =
+            carry_out(robot, &command).map_err(|error| ExecuteError::Robot { phase, error })?;
+        match primitive.next(report)? {
+            Next::Do(next) => command = next,
+            Next::Done(outcome) => return Ok(outcome),
+        }
+        if primitive.phase() != phase {
+            phase = primitive.phase();
+            observe(phase);
+        }
+    }
+}
+
+fn carry_out<R: Robot>(robot: &mut R, command: &Command) -> Result<Report, R::Error> {
+    Ok(match command {
+        Command::Follow(trajectory) => match robot.follow(trajectory)? {
+            true => Report::Arrived(robot.joints()?),
+            false => Report::Lagged(robot.joints()?),
+        },
+        Command::FollowUntilContact(trajectory) => match robot.follow_until_contact(trajectory)? {
+            true => Report::Contact(robot.joints()?),
+            false => Report::NoContact(robot.joints()?),
+        },
+        Command::SetSuction(on) => {
+            robot.set_suction(*on)?;
+            Report::SuctionSet
+        }
+        Command::ReadVacuum => Report::Holds(robot.holds()?),
+    })
+}

@@ -1,0 +1,437 @@
+//! Every way in which a primitive ends, played by a robot that follows a script.
+
+use nalgebra::{Isometry2, Vector2};
+use pick_place::{
+    ExecuteError, Outcome, Phase, PickPlace, PrimitiveError, PrimitiveSettings, Robot, execute,
+};
+use ur5::{Arm, JointTrajectory, Joints, WorkCell};
+
+/// A command as the robot saw it, with where the tip ended.
+#[derive(Clone, Copy, Debug, PartialEq)]
+enum Seen {
+    Follow { height_m: f64 },
+    Descend { height_m: f64 },
+    Suction(bool),
+}
+
+/// Perfect joints, a scripted world.
+struct ScriptedRobot {
+    arm: Arm,
+    joints: Joints,
+    suction: bool,
+    /// What suction holds when it is on.
+    grasps: bool,
+    /// Height of the first contact at pick and at place; none: no contact.
+    contacts_m: [Option<f64>; 2],
+    /// The object falls off during this motion (counted from 0).
+    drops_at: Option<usize>,
+    /// The tip lags during this motion.
+    lags_at: Option<usize>,
+    /// Commands from this one on fail.
+    fails_at: Option<usize>,
+    dropped: bool,
+    motions: usize,
+    descents: usize,
+    calls: usize,
+    seen: Vec<Seen>,
+    path: Vec<JointTrajectory>,
+}
+
+impl ScriptedRobot {
+    fn new() -> Self {
+        let arm = WorkCell::builtin().unwrap().arm;
+        Self {
+            joints: arm.home,
+            arm,
+            suction: false,
+            grasps: true,
+            contacts_m: [Some(0.04), Some(0.045)],
+            drops_at: None,
+            lags_at: None,
+            fails_at: None,
+            dropped: false,
+            motions: 0,
+            descents: 0,
+            calls: 0,
+            seen: Vec::new(),
+            path: Vec::new(),
+        }
+    }
+
+    fn command(&mut self) -> Result<(), String> {
+        self.calls += 1;
+        match self.fails_at {
+            Some(call) if self.calls > call => {
+                Err(format!("protective stop at call {}", self.calls))
+            }
+            _ => Ok(()),
+        }
+    }
+
+    fn begin(&mut self, trajectory: &JointTrajectory) {
+        trajectory.check_limits(&self.arm).unwrap();
+        let start = trajectory.points()[0].positions_rad;
+        assert!(
+            (start - self.joints).amax() < 1e-9,
+            "a motion starts where the arm is not"
+        );
+        self.path.push(trajectory.clone());
+        if self.drops_at == Some(self.motions) {
+            self.dropped = true;
+        }
+        self.motions += 1;
+    }
+
+    fn height_m(&self) -> f64 {
+        self.arm.tip(&self.joints).translation.z
+    }
+
+    fn run(
+        &mut self,
+        settings: &PrimitiveSettings,
+    ) -> (Result<Outcome, ExecuteError<String>>, Vec<Phase>) {
+        let arm = self.arm.clone();
+        let mut phases = Vec::new();
+        let outcome = execute(self, &arm, &action(), settings, |phase| phases.push(phase));
+        (outcome, phases)
+    }
+
+    fn is_home(&self) -> bool {
+        (self.joints - self.arm.home).amax() < 1e-9
+    }
+}
+
+impl Robot for ScriptedRobot {
+    type Error = String;
+
+    fn joints(&mut self) -> Result<Joints, String> {
+        Ok(self.joints)
+    }
+
+    fn follow(&mut self, trajectory: &JointTrajectory) -> Result<bool, String> {
+        self.command()?;
+        let lags = self.lags_at == Some(self.motions);
+        self.begin(trajectory);
+        let duration = if lags {
+            trajectory.duration() / 2
+        } else {
+            trajectory.duration()
+        };
+        self.joints = trajectory.sample(duration);
+        self.seen.push(Seen::Follow {
+            height_m: self.height_m(),
+        });
+        Ok(!lags)
+    }
+
+    fn follow_until_contact(&mut self, trajectory: &JointTrajectory) -> Result<bool, String> {
+        self.command()?;
+        self.begin(trajectory);
+        let contact_m = self.contacts_m[self.descents];
+        self.descents += 1;
+        let mut touched = false;
+        for point in trajectory.points() {
+            self.joints = point.positions_rad;
+            touched = contact_m.is_some_and(|height_m| self.height_m() <= height_m);
+            if touched {
+                break;
+            }
+        }
+        self.seen.push(Seen::Descend {
+            height_m: self.height_m(),
+        });
+        Ok(touched)
+    }
+
+    fn set_suction(&mut self, on: bool) -> Result<(), String> {
+        self.command()?;
+        self.suction = on;
+        self.seen.push(Seen::Suction(on));
+        Ok(())
+    }
+
+    fn holds(&mut self) -> Result<bool, String> {
+        self.command()?;
+        Ok(self.suction && self.grasps && !self.dropped)
+    }
+}
+
+fn action() -> PickPlace {
+    PickPlace {
+        pick: Isometry2::new(Vector2::new(0.4, -0.2), 0.0),
+        place: Isometry2::new(Vector2::new(0.6, 0.25), 1.2),
+    }
+}
+
+fn suctions(robot: &ScriptedRobot) -> Vec<bool> {
+    let suction = |seen: &Seen| match seen {
+        Seen::Suction(on) => Some(*on),
+        _ => None,
+    };
+    robot.seen.iter().filter_map(suction).collect()
+}
+
+use Phase::*;
+
+#[test]
+fn a_pick_and_place_goes_through_every_phase_in_order_and_ends_at_home() {
+    let mut robot = ScriptedRobot::new();
+    let (outcome, phases) = robot.run(&PrimitiveSettings::RIGID);
+    assert_eq!(outcome, Ok(Outcome::Placed));
+    assert_eq!(
+        phases,
+        [
+            Approach,
+            DescendToPick,
+            Grasp,
+            Lift,
+            CheckGrasp,
+            Transfer,
+            DescendToPlace,
+            Release,
+            Retreat,
+            Home
+        ]
+    );
+    assert!(robot.is_home());
+    assert!(!robot.suction);
+    let heights: Vec<String> = robot
+        .seen
+        .iter()
+        .map(|seen| match seen {
+            Seen::Follow { height_m } => format!("follow {height_m:.2}"),
+            Seen::Descend { height_m } => format!("descend {height_m:.2}"),
+            Seen::Suction(on) => format!("suction {on}"),
+        })
+        .collect();
+    assert_eq!(
+        heights,
+        [
+            "follow 0.24",
+            "descend 0.04",
+            "suction true",
+            "follow 0.24",
+            "follow 0.24",
+            "descend 0.04",
+            "suction false",
+            "follow 0.24",
+            "follow 0.32",
+        ]
+    );
+}
+
+#[test]
+fn the_object_is_carried_to_the_place_and_turned_by_the_difference_of_the_yaws() {
+    let mut robot = ScriptedRobot::new();
+    robot.run(&PrimitiveSettings::RIGID).0.unwrap();
+    let (grasp, release) = (&robot.path[2], &robot.path[4]);
+    let grasp = robot.arm.tip(&grasp.points()[0].positions_rad);
+    let release = robot.arm.tip(&release.last().positions_rad);
+    assert!((grasp.translation.vector.xy() - action().pick.translation.vector).norm() < 1e-9);
+    assert!((release.translation.vector.xy() - action().place.translation.vector).norm() < 1e-9);
+    let turn = (release.rotation * grasp.rotation.inverse()).scaled_axis();
+    assert!(
+        (turn - nalgebra::Vector3::new(0.0, 0.0, 1.2)).norm() < 1e-9,
+        "{turn}"
+    );
+}
+
+#[test]
+fn beads_are_carried_low() {
+    let mut robot = ScriptedRobot::new();
+    robot.contacts_m = [Some(0.012), Some(0.012)];
+    robot.run(&PrimitiveSettings::BEADS).0.unwrap();
+    let contact_m = robot
+        .arm
+        .tip(&robot.path[2].points()[0].positions_rad)
+        .translation
+        .z;
+    for point in robot.path[3].points() {
+        let height_m = robot.arm.tip(&point.positions_rad).translation.z;
+        assert!((height_m - contact_m - PrimitiveSettings::BEADS.lift_m).abs() < 1e-9);
+    }
+}
+
+#[test]
+fn without_contact_nothing_is_grasped() {
+    let mut robot = ScriptedRobot::new();
+    robot.contacts_m[0] = None;
+    let (outcome, phases) = robot.run(&PrimitiveSettings::RIGID);
+    assert_eq!(outcome, Ok(Outcome::NoContact));
+    assert_eq!(phases, [Approach, DescendToPick, Retreat, Home]);
+    assert_eq!(suctions(&robot), [] as [bool; 0]);
+    assert!(robot.is_home());
+}
+
+#[test]
+fn a_failed_grasp_is_released_and_goes_home() {
+    let mut robot = ScriptedRobot::new();
+    robot.grasps = false;
+    let (outcome, phases) = robot.run(&PrimitiveSettings::RIGID);
+    assert_eq!(outcome, Ok(Outcome::GraspFailed));
+    assert!(!phases.contains(&Transfer));
+    assert_eq!(suctions(&robot), [true, false]);
+    assert!(robot.is_home());
+}
+
+#[test]
+fn an_object_lost_on_the_way_is_noticed() {
+    // Motions: 0 approach, 1 descend, 2 lift, 3 transfer, 4 descend.
+    for drops_at in [3, 4] {
+        let mut robot = ScriptedRobot::new();
+        robot.drops_at = Some(drops_at);
+        let (outcome, _) = robot.run(&PrimitiveSettings::RIGID);
+        assert_eq!(
+            outcome,
+            Ok(Outcome::Dropped),
+            "dropped in motion {drops_at}"
+        );
+        assert_eq!(suctions(&robot), [true, false]);
+        assert!(robot.is_home());
+    }
+}
+
+#[test]
+fn a_lagging_tip_lets_go_and_goes_home() {
+    for lags_at in [2, 3] {
+        let mut robot = ScriptedRobot::new();
+        robot.lags_at = Some(lags_at);
+        let (outcome, phases) = robot.run(&PrimitiveSettings::BEADS);
+        assert_eq!(
+            outcome,
+            Ok(Outcome::LagAborted),
+            "lagged in motion {lags_at}"
+        );
+        assert_eq!(suctions(&robot), [true, false]);
+        assert_eq!(phases[phases.len() - 3..], [Release, Retreat, Home]);
+        assert!(!phases.contains(&DescendToPlace));
+        assert!(robot.is_home());
+    }
+}
+
+#[test]
+fn a_lagging_tip_with_nothing_held_stops_everything() {
+    let mut robot = ScriptedRobot::new();
+    robot.lags_at = Some(5);
+    let (outcome, _) = robot.run(&PrimitiveSettings::RIGID);
+    assert_eq!(
+        outcome,
+        Err(PrimitiveError::Blocked { phase: Retreat }.into())
+    );
+    assert_eq!(robot.motions, 6);
+}
+
+#[test]
+fn after_an_error_nothing_moves_and_suction_stays_as_it_was() {
+    let mut complete = ScriptedRobot::new();
+    complete.run(&PrimitiveSettings::RIGID).0.unwrap();
+    for fails_at in 0..complete.calls {
+        let mut robot = ScriptedRobot::new();
+        robot.fails_at = Some(fails_at);
+        let (outcome, _) = robot.run(&PrimitiveSettings::RIGID);
+        assert!(
+            matches!(outcome, Err(ExecuteError::Robot { .. })),
+            "{outcome:?}"
+        );
+        assert_eq!(robot.calls, fails_at + 1, "a command followed the error");
+        assert_eq!(robot.seen[..], complete.seen[..robot.seen.len()]);
+    }
+}
+
+#[test]
+fn an_arm_that_starts_low_rises_first() {
+    let mut robot = ScriptedRobot::new();
+    let low = Arm::tip_down(&Isometry2::new(Vector2::new(0.5, 0.1), 0.3), 0.02);
+    robot.joints = robot.arm.solve(&low, &robot.arm.ready).unwrap();
+    let (outcome, _) = robot.run(&PrimitiveSettings::RIGID);
+    assert_eq!(outcome, Ok(Outcome::Placed));
+    let rise = robot.path[0].points();
+    for point in rise {
+        let tip = robot.arm.tip(&point.positions_rad).translation.vector;
+        assert!((tip.xy() - Vector2::new(0.5, 0.1)).norm() < 1e-9);
+    }
+    let end = robot.arm.tip(&rise[rise.len() - 1].positions_rad);
+    assert!((end.translation.z - PrimitiveSettings::RIGID.clearance_m).abs() < 1e-9);
+}
+
+#[test]
+fn a_full_gripper_is_refused_before_anything_moves() {
+    let mut robot = ScriptedRobot::new();
+    robot.suction = true;
+    let (outcome, _) = robot.run(&PrimitiveSettings::RIGID);
+    assert_eq!(outcome, Err(PrimitiveError::AlreadyHolding.into()));
+    assert_eq!(robot.seen, []);
+}
+
+#[test]
+fn bad_actions_and_settings_are_refused_by_name_before_anything_moves() {
+    let mut robot = ScriptedRobot::new();
+    let arm = robot.arm.clone();
+    let mut refusal = |action: PickPlace, settings: PrimitiveSettings| {
+        execute(&mut robot, &arm, &action, &settings, |_| ())
+            .unwrap_err()
+            .to_string()
+    };
+    let rigid = PrimitiveSettings::RIGID;
+    let mut bad = action();
+    bad.pick.translation.y = f64::NAN;
+    assert_eq!(refusal(bad, rigid), "the pick pose is not finite");
+    let mut bad = action();
+    bad.place.translation.x = 1.1;
+    let text = refusal(bad, rigid);
+    assert!(
+        text.starts_with("the place pose is out of reach") && text.contains("1.1"),
+        "{text}"
+    );
+    for (settings, name) in [
+        (
+            PrimitiveSettings {
+                clearance_m: 0.0,
+                ..rigid
+            },
+            "clearance_m",
+        ),
+        (
+            PrimitiveSettings {
+                lift_m: f64::NAN,
+                ..rigid
+            },
+            "lift_m",
+        ),
+        (
+            PrimitiveSettings {
+                travel_m_s: -1.0,
+                ..rigid
+            },
+            "travel_m_s",
+        ),
+        (
+            PrimitiveSettings {
+                carry_m_s: 20.0,
+                ..rigid
+            },
+            "carry_m_s",
+        ),
+        (
+            PrimitiveSettings {
+                descend_m_s: 0.0,
+                ..rigid
+            },
+            "descend_m_s",
+        ),
+        (
+            PrimitiveSettings {
+                acceleration_m_s2: f64::INFINITY,
+                ..rigid
+            },
+            "acceleration_m_s2",
+        ),
+    ] {
+        let text = refusal(action(), settings);
+        assert!(
+            text.starts_with(name) && text.contains("expected"),
+            "{text}"
+        );
+    }
+    assert_eq!(robot.calls, 0);
+}

@@ -1,0 +1,776 @@
+//! What may move: the approvals of an operator against what the executor knows.
+//!
+//! Pure: no clock, no middleware. Only the newest proposal can be approved, once; what came before
+//! is remembered so that a refusal can say what became of it.
+
+use std::collections::VecDeque;
+use std::time::Duration;
+
+use heightmap::{Heightmap, Workspace};
+use pick_place::{PickPlace, PrimitiveSettings};
+use ur5::Joints;
+
+use crate::status::DriverStatus;
+
+/// Heightmaps kept, by stamp: a proposal is compared with the one that it was made from.
+const HEIGHTMAPS: usize = 8;
+/// Proposals whose fate is remembered.
+const PROPOSALS: usize = 1024;
+
+/// What a proposal must keep to.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Rules {
+    /// Frame of proposals.
+    pub frame: String,
+    /// Where pick and place poses may lie.
+    pub workspace: Workspace,
+    /// Largest heights and speeds.
+    pub most: PrimitiveSettings,
+    /// A cell of the heightmap has changed when its height differs by more.
+    pub observation_tolerance_m: f32,
+    /// The observation has changed when more than this share of its cells has.
+    pub observation_changed_fraction: f64,
+    /// The driver's streams may not be older.
+    pub status_max_age: Duration,
+}
+
+/// A proposal as it arrived, unchecked.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Proposal {
+    /// Identifies it.
+    pub id: u64,
+    /// Frame of its poses.
+    pub frame: String,
+    /// Stamp of the heightmap that it was made from.
+    pub stamp: Duration,
+    /// The poses.
+    pub action: PickPlace,
+    /// The heights and speeds.
+    pub settings: PrimitiveSettings,
+}
+
+/// What an operator can say to the executor.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Decision {
+    /// Carry the proposal out.
+    Approve,
+    /// Do not.
+    Reject,
+    /// Stop what moves, and withdraw what is proposed.
+    Stop,
+}
+
+/// How a confirmation is answered at once, without motion.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Answer {
+    /// The confirmation or its proposal is not valid.
+    Refused,
+    /// The operator rejected the proposal.
+    Rejected,
+    /// The operator withdrew the proposal by a stop.
+    Stopped,
+}
+
+/// What is to be done about a confirmation.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Verdict {
+    /// Move; [`Gate::finish`] has to follow.
+    Move(Box<Proposal>),
+    /// Stop the motion under way.
+    Cancel,
+    /// Report, with the reason.
+    Answer(Answer, String),
+    /// Something it needs may still be on its way: ask again a little later, then refuse for this
+    /// reason.
+    Wait(String),
+    /// Nothing to do or to say.
+    Nothing,
+}
+
+impl Verdict {
+    fn refuse(reason: impl Into<String>) -> Self {
+        Self::Answer(Answer::Refused, reason.into())
+    }
+}
+
+/// What became of a proposal.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Fate {
+    Open,
+    Superseded,
+    Moving,
+    Done,
+    Rejected,
+    Withdrawn,
+}
+
+impl Fate {
+    fn reason(self, id: u64) -> String {
+        let what = match self {
+            Self::Open => "is open",
+            Self::Superseded => "was superseded by a newer one",
+            Self::Moving => "is already being carried out",
+            Self::Done => "was already carried out",
+            Self::Rejected => "was already rejected",
+            Self::Withdrawn => "was withdrawn by a stop",
+        };
+        format!("proposal {id} {what}")
+    }
+}
+
+/// Decides what may move.
+#[derive(Debug)]
+pub struct Gate {
+    rules: Rules,
+    heightmaps: VecDeque<(Duration, Heightmap)>,
+    /// The newest proposal, or what is wrong with it.
+    newest: Option<(u64, Result<Proposal, String>)>,
+    /// Oldest first; the last is the newest proposal's.
+    fates: VecDeque<(u64, Fate)>,
+    moving: Option<u64>,
+    /// Observations from before the end of the last motion are no ground to move on.
+    moved_until: Option<Duration>,
+}
+
+impl Gate {
+    /// A gate that knows of nothing yet.
+    pub fn new(rules: Rules) -> Self {
+        Self {
+            rules,
+            heightmaps: VecDeque::new(),
+            newest: None,
+            fates: VecDeque::new(),
+            moving: None,
+            moved_until: None,
+        }
+    }
+
+    /// The proposal that is being carried out.
+    pub fn moving(&self) -> Option<u64> {
+        self.moving
+    }
+
+    /// Takes the newest observation.
+    pub fn observe(&mut self, stamp: Duration, heightmap: Heightmap) {
+        // The same frame may come again.
+        self.heightmaps.retain(|(known, _)| *known != stamp);
+        if self.heightmaps.len() == HEIGHTMAPS {
+            self.heightmaps.pop_front();
+        }
+        self.heightmaps.push_back((stamp, heightmap));
+    }
+
+    /// Takes a proposal; it supersedes the one before.
+    ///
+    /// # Errors
+    /// What is wrong with it: it cannot be approved. A repeated message changes nothing.
+    pub fn propose(&mut self, proposal: Proposal) -> Result<(), String> {
+        let id = proposal.id;
+        if let Some(fate) = self.fate(id) {
+            return match &self.newest {
+                Some((newest, Ok(known))) if *newest == id && *known != proposal => {
+                    let reason = format!("proposal {id} came twice with different contents");
+                    self.newest = Some((id, Err(reason.clone())));
+                    Err(reason)
+                }
+                Some((newest, checked)) if *newest == id => {
+                    checked.as_ref().map(|_| ()).map_err(Clone::clone)
+                }
+                _ => Err(fate.reason(id)),
+            };
+        }
+        self.set_fate_of_open(Fate::Superseded);
+        if self.fates.len() == PROPOSALS {
+            self.fates.pop_front();
+        }
+        self.fates.push_back((id, Fate::Open));
+        let checked = self.rules.check(&proposal);
+        self.newest = Some((id, checked.clone().map(|()| proposal)));
+        checked
+    }
+
+    /// Takes a confirmation at a monotonic time. `plan` says why the motion cannot be planned from
+    /// the present joint positions, if it cannot.
+    pub fn confirm(
+        &mut self,
+        id: u64,
+        decision: Decision,
+        status: &DriverStatus,
+        now: Duration,
+        plan: impl FnOnce(&Joints, &Proposal) -> Result<(), String>,
+    ) -> Verdict {
+        match decision {
+            Decision::Approve => self.approve(id, status, now, plan),
+            Decision::Reject => self.reject(id),
+            Decision::Stop => self.stop(id),
+        }
+    }
+
+    /// The motion of [`Verdict::Move`] has ended; `until` is the ROS time from which on
+    /// observations show its result.
+    pub fn finish(&mut self, until: Duration) {
+        if let Some(id) = self.moving.take() {
+            self.set_fate(id, Fate::Done);
+            self.moved_until = Some(until);
+        }
+    }
+
+    fn approve(
+        &mut self,
+        id: u64,
+        status: &DriverStatus,
+        now: Duration,
+        plan: impl FnOnce(&Joints, &Proposal) -> Result<(), String>,
+    ) -> Verdict {
+        match self.fate(id) {
+            None => return Verdict::Wait(format!("proposal {id} is unknown")),
+            Some(Fate::Open) => {}
+            Some(fate) => return Verdict::refuse(fate.reason(id)),
+        }
+        if let Some(moving) = self.moving {
+            return Verdict::refuse(format!(
+                "proposal {id} was approved while proposal {moving} is being carried out"
+            ));
+        }
+        // Only the newest proposal is open.
+        let proposal = match &self.newest {
+            Some((newest, Ok(proposal))) if *newest == id => proposal,
+            Some((newest, Err(reason))) if *newest == id => return Verdict::refuse(reason.clone()),
+            _ => return Verdict::refuse(Fate::Superseded.reason(id)),
+        };
+        if let Some(obstacle) = status.obstacle(now, self.rules.status_max_age) {
+            return Verdict::refuse(format!("proposal {id}: {obstacle}"));
+        }
+        if let Some(until) = self.moved_until
+            && proposal.stamp < until
+        {
+            return Verdict::refuse(format!(
+                "proposal {id} was made from an observation at {}, before the last motion ended at {}",
+                seconds(proposal.stamp),
+                seconds(until)
+            ));
+        }
+        if let Err(verdict) = self.unchanged(proposal) {
+            return verdict;
+        }
+        let Some((reading, _)) = status.joints else {
+            return Verdict::refuse(format!("proposal {id}: no joint_states have arrived"));
+        };
+        if let Err(reason) = plan(&reading.positions_rad, proposal) {
+            return Verdict::refuse(format!("proposal {id}: {reason}"));
+        }
+        let proposal = Box::new(proposal.clone());
+        self.set_fate(id, Fate::Moving);
+        self.moving = Some(id);
+        Verdict::Move(proposal)
+    }
+
+    fn reject(&mut self, id: u64) -> Verdict {
+        match self.fate(id) {
+            None => Verdict::Wait(format!("proposal {id} is unknown")),
+            Some(Fate::Open) => {
+                self.set_fate(id, Fate::Rejected);
+                Verdict::Answer(Answer::Rejected, "rejected by the operator".into())
+            }
+            Some(fate) => Verdict::refuse(fate.reason(id)),
+        }
+    }
+
+    /// A stop is honoured whatever proposal it names.
+    fn stop(&mut self, id: u64) -> Verdict {
+        let withdrawn = self.set_fate_of_open(Fate::Withdrawn);
+        if self.moving.is_some() {
+            return Verdict::Cancel;
+        }
+        match self.fate(id) {
+            None => Verdict::refuse(format!("proposal {id} is unknown; nothing was moving")),
+            Some(Fate::Withdrawn) if withdrawn => Verdict::Answer(
+                Answer::Stopped,
+                "stopped by the operator; nothing was moving".into(),
+            ),
+            // After its result: a word to others.
+            Some(_) => Verdict::Nothing,
+        }
+    }
+
+    /// Whether the newest heightmap shows what the proposal's own does.
+    fn unchanged(&self, proposal: &Proposal) -> Result<(), Verdict> {
+        let id = proposal.id;
+        let own = self
+            .heightmaps
+            .iter()
+            .find(|(stamp, _)| *stamp == proposal.stamp);
+        let (Some((_, own)), Some((stamp, newest))) = (own, self.heightmaps.back()) else {
+            return Err(Verdict::Wait(format!(
+                "proposal {id}: the heightmap of {}, which it was made from, has not arrived",
+                seconds(proposal.stamp)
+            )));
+        };
+        if own.workspace != newest.workspace {
+            return Err(Verdict::refuse(format!(
+                "proposal {id}: the heightmap of {} covers another workspace than the one that it was made from",
+                seconds(*stamp)
+            )));
+        }
+        let changed = own.changed_fraction(newest, self.rules.observation_tolerance_m);
+        if changed > self.rules.observation_changed_fraction {
+            return Err(Verdict::refuse(format!(
+                "proposal {id}: the observation has changed since: {:.2} % of the cells of the heightmap of {} by more than {} m, expected at most {:.2} %",
+                100.0 * changed,
+                seconds(*stamp),
+                self.rules.observation_tolerance_m,
+                100.0 * self.rules.observation_changed_fraction
+            )));
+        }
+        Ok(())
+    }
+
+    fn fate(&self, id: u64) -> Option<Fate> {
+        let mut known = self.fates.iter().rev();
+        known.find(|(known, _)| *known == id).map(|(_, fate)| *fate)
+    }
+
+    fn set_fate(&mut self, id: u64, fate: Fate) {
+        let mut known = self.fates.iter_mut().rev();
+        if let Some((_, known)) = known.find(|(known, _)| *known == id) {
+            *known = fate;
+        }
+    }
+
+    /// Says whether a proposal was open.
+    fn set_fate_of_open(&mut self, fate: Fate) -> bool {
+        let mut open = self.fates.iter_mut().rev();
+        match open.find(|(_, fate)| *fate == Fate::Open) {
+            Some((_, open)) => {
+                *open = fate;
+                true
+            }
+            None => false,
+        }
+    }
+}
+
+impl Rules {
+    /// Checks what can be checked of a proposal by itself.
+    fn check(&self, proposal: &Proposal) -> Result<(), String> {
+        let id = proposal.id;
+        if proposal.frame != self.frame {
+            return Err(format!(
+                "proposal {id}: frame is `{}`, expected `{}`",
+                proposal.frame, self.frame
+            ));
+        }
+        let PickPlace { pick, place } = &proposal.action;
+        for (which, pose) in [("pick", pick), ("place", place)] {
+            let (x, y, yaw) = (
+                pose.translation.x,
+                pose.translation.y,
+                pose.rotation.angle(),
+            );
+            if !(x.is_finite() && y.is_finite() && yaw.is_finite()) {
+                return Err(format!(
+                    "proposal {id}: {which} pose x {x} m, y {y} m, yaw {yaw} rad is not finite"
+                ));
+            }
+            if self
+                .workspace
+                .pixel(&pose.translation.vector.into())
+                .is_none()
+            {
+                let Workspace {
+                    origin_m,
+                    rows,
+                    cols,
+                    pixel_size_m,
+                    ..
+                } = self.workspace;
+                return Err(format!(
+                    "proposal {id}: {which} pose x {x:.4} m, y {y:.4} m lies outside the workspace, x {}..{} m, y {}..{} m",
+                    origin_m.x,
+                    origin_m.x + cols as f64 * pixel_size_m,
+                    origin_m.y,
+                    origin_m.y + rows as f64 * pixel_size_m,
+                ));
+            }
+        }
+        let (settings, most) = (&proposal.settings, &self.most);
+        let ranges = [
+            ("clearance_m", settings.clearance_m, most.clearance_m),
+            ("lift_m", settings.lift_m, most.lift_m),
+            ("travel_m_s", settings.travel_m_s, most.travel_m_s),
+            ("carry_m_s", settings.carry_m_s, most.carry_m_s),
+            ("descend_m_s", settings.descend_m_s, most.descend_m_s),
+            (
+                "acceleration_m_s2",
+                settings.acceleration_m_s2,
+                most.acceleration_m_s2,
+            ),
+        ];
+        for (name, value, most) in ranges {
+            // Not a number fails both comparisons.
+            if !(value > 0.0 && value <= most) {
+                return Err(format!(
+                    "proposal {id}: settings.{name} is {value}, expected above 0 and at most {most}"
+                ));
+            }
+        }
+        Ok(())
+    }
+}
+
+fn seconds(stamp: Duration) -> String {
+    format!("{:.3} s", stamp.as_secs_f64())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::status::tests::ready;
+    use nalgebra::Isometry2;
+
+    const NOW: Duration = Duration::from_secs(100);
+
+    fn rules() -> Rules {
+        Rules {
+            frame: "world".into(),
+            workspace: Workspace::RAVENS,
+            most: PrimitiveSettings {
+                clearance_m: 0.5,
+                lift_m: 0.5,
+                travel_m_s: 1.0,
+                carry_m_s: 1.0,
+                descend_m_s: 0.2,
+                acceleration_m_s2: 5.0,
+            },
+            observation_tolerance_m: 0.005,
+            observation_changed_fraction: 0.001,
+            status_max_age: Duration::from_secs(1),
+        }
+    }
+
+    fn proposal(id: u64) -> Proposal {
+        Proposal {
+            id,
+            frame: "world".into(),
+            stamp: Duration::from_secs(5),
+            action: PickPlace {
+                pick: Isometry2::new(nalgebra::Vector2::new(0.4, 0.2), 0.0),
+                place: Isometry2::new(nalgebra::Vector2::new(0.5, -0.2), 1.0),
+            },
+            settings: PrimitiveSettings {
+                clearance_m: 0.1,
+                lift_m: 0.05,
+                travel_m_s: 0.8,
+                carry_m_s: 0.5,
+                descend_m_s: 0.1,
+                acceleration_m_s2: 2.5,
+            },
+        }
+    }
+
+    /// A gate that has seen a heightmap and proposal 7, made from it.
+    fn gate() -> Gate {
+        let mut gate = Gate::new(rules());
+        gate.observe(Duration::from_secs(5), Heightmap::new(Workspace::RAVENS));
+        gate.propose(proposal(7)).unwrap();
+        gate
+    }
+
+    fn decide(gate: &mut Gate, id: u64, decision: Decision) -> Verdict {
+        gate.confirm(id, decision, &ready(NOW), NOW, |_, _| Ok(()))
+    }
+
+    fn approve(gate: &mut Gate, id: u64) -> Verdict {
+        decide(gate, id, Decision::Approve)
+    }
+
+    #[track_caller]
+    fn assert_refused(gate: &Gate, verdict: Verdict, expected: &[&str]) {
+        let Verdict::Answer(Answer::Refused, reason) = &verdict else {
+            panic!("expected a refusal, found {verdict:?}");
+        };
+        for part in expected {
+            assert!(reason.contains(part), "{reason:?} lacks {part:?}");
+        }
+        assert_eq!(gate.moving(), None);
+    }
+
+    #[test]
+    fn an_approved_proposal_moves_once() {
+        let mut gate = gate();
+        assert_eq!(approve(&mut gate, 7), Verdict::Move(Box::new(proposal(7))));
+        assert_eq!(gate.moving(), Some(7));
+        gate.finish(Duration::from_secs(9));
+        assert_eq!(gate.moving(), None);
+    }
+
+    #[test]
+    fn nothing_moves_without_a_confirmation() {
+        let mut gate = gate();
+        gate.observe(Duration::from_secs(6), Heightmap::new(Workspace::RAVENS));
+        gate.propose(proposal(8)).unwrap();
+        assert_eq!(gate.moving(), None);
+    }
+
+    #[test]
+    fn a_rejected_proposal_does_not_move_and_cannot_be_approved_any_more() {
+        let mut gate = gate();
+        let verdict = decide(&mut gate, 7, Decision::Reject);
+        assert!(
+            matches!(verdict, Verdict::Answer(Answer::Rejected, _)),
+            "{verdict:?}"
+        );
+        let verdict = approve(&mut gate, 7);
+        assert_refused(&gate, verdict, &["7", "already rejected"]);
+        let verdict = decide(&mut gate, 7, Decision::Reject);
+        assert_refused(&gate, verdict, &["7", "already rejected"]);
+    }
+
+    #[test]
+    fn a_stale_approval_moves_nothing() {
+        let mut gate = gate();
+        gate.propose(proposal(8)).unwrap();
+        let verdict = approve(&mut gate, 7);
+        assert_refused(&gate, verdict, &["7", "superseded"]);
+        // The newer one is not touched by that.
+        assert!(matches!(approve(&mut gate, 8), Verdict::Move(_)));
+    }
+
+    #[test]
+    fn a_duplicate_approval_moves_nothing() {
+        let mut gate = gate();
+        assert!(matches!(approve(&mut gate, 7), Verdict::Move(_)));
+        let verdict = approve(&mut gate, 7);
+        assert!(
+            matches!(&verdict, Verdict::Answer(Answer::Refused, r) if r.contains("already being carried out")),
+            "{verdict:?}"
+        );
+        gate.finish(Duration::from_secs(9));
+        let verdict = approve(&mut gate, 7);
+        assert_refused(&gate, verdict, &["7", "already carried out"]);
+    }
+
+    #[test]
+    fn a_proposal_that_is_sent_again_cannot_be_approved_again() {
+        let mut gate = gate();
+        assert!(matches!(approve(&mut gate, 7), Verdict::Move(_)));
+        gate.finish(Duration::from_secs(4));
+        gate.propose(proposal(7)).unwrap();
+        let verdict = approve(&mut gate, 7);
+        assert_refused(&gate, verdict, &["already carried out"]);
+        // Nor one from further back.
+        gate.propose(proposal(8)).unwrap();
+        assert!(
+            gate.propose(proposal(7))
+                .unwrap_err()
+                .contains("already carried out")
+        );
+        let verdict = approve(&mut gate, 7);
+        assert_refused(&gate, verdict, &["already carried out"]);
+    }
+
+    #[test]
+    fn an_unknown_approval_waits_for_its_proposal_and_moves_nothing() {
+        let mut gate = gate();
+        let verdict = approve(&mut gate, 99);
+        assert!(
+            matches!(&verdict, Verdict::Wait(r) if r.contains("99") && r.contains("unknown")),
+            "{verdict:?}"
+        );
+        assert_eq!(gate.moving(), None);
+        assert!(matches!(
+            decide(&mut gate, 99, Decision::Reject),
+            Verdict::Wait(_)
+        ));
+    }
+
+    #[test]
+    fn an_approval_while_moving_is_refused() {
+        let mut gate = gate();
+        assert!(matches!(approve(&mut gate, 7), Verdict::Move(_)));
+        gate.propose(proposal(8)).unwrap();
+        let verdict = approve(&mut gate, 8);
+        assert!(
+            matches!(&verdict, Verdict::Answer(Answer::Refused, r) if r.contains('8') && r.contains("proposal 7")),
+            "{verdict:?}"
+        );
+        assert_eq!(gate.moving(), Some(7));
+    }
+
+    #[test]
+    fn a_pose_with_nan_or_outside_the_workspace_moves_nothing() {
+        for (bad, expected) in [
+            (f64::NAN, "not finite"),
+            (f64::INFINITY, "not finite"),
+            (0.9, "outside the workspace"),
+        ] {
+            for which in ["pick", "place"] {
+                let mut gate = gate();
+                let mut bad_one = proposal(8);
+                let pose = match which {
+                    "pick" => &mut bad_one.action.pick,
+                    _ => &mut bad_one.action.place,
+                };
+                pose.translation.x = bad;
+                let error = gate.propose(bad_one).unwrap_err();
+                assert!(error.contains(which) && error.contains(expected), "{error}");
+                let verdict = approve(&mut gate, 8);
+                assert_refused(&gate, verdict, &["8", which, expected]);
+                // It has superseded the one before all the same.
+                let verdict = approve(&mut gate, 7);
+                assert_refused(&gate, verdict, &["7", "superseded"]);
+            }
+        }
+        let mut gate = gate();
+        let mut turned = proposal(8);
+        turned.action.place = Isometry2::new(nalgebra::Vector2::new(0.5, 0.0), f64::NAN);
+        assert!(gate.propose(turned).unwrap_err().contains("not finite"));
+    }
+
+    #[test]
+    fn settings_out_of_range_move_nothing() {
+        for bad in [f64::NAN, 0.0, -1.0, 100.0] {
+            let mut gate = gate();
+            let mut fast = proposal(8);
+            fast.settings.carry_m_s = bad;
+            assert!(gate.propose(fast).is_err());
+            let verdict = approve(&mut gate, 8);
+            assert_refused(&gate, verdict, &["8", "carry_m_s"]);
+        }
+    }
+
+    #[test]
+    fn a_proposal_in_another_frame_moves_nothing() {
+        let mut gate = gate();
+        let mut elsewhere = proposal(8);
+        elsewhere.frame = "front_camera".into();
+        gate.propose(elsewhere).unwrap_err();
+        let verdict = approve(&mut gate, 8);
+        assert_refused(&gate, verdict, &["front_camera", "world"]);
+    }
+
+    #[test]
+    fn an_id_that_stands_for_two_contents_moves_nothing() {
+        let mut gate = gate();
+        let mut other = proposal(7);
+        other.action.place.translation.y = 0.1;
+        assert!(
+            gate.propose(other)
+                .unwrap_err()
+                .contains("different contents")
+        );
+        let verdict = approve(&mut gate, 7);
+        assert_refused(&gate, verdict, &["7", "different contents"]);
+    }
+
+    #[test]
+    fn an_approval_after_the_observation_changed_moves_nothing() {
+        let mut gate = gate();
+        let mut changed = Heightmap::new(Workspace::RAVENS);
+        changed.height_m[..100].fill(0.02);
+        gate.observe(Duration::from_secs(6), changed.clone());
+        let verdict = approve(&mut gate, 7);
+        assert_refused(&gate, verdict, &["7", "observation has changed", "6.000 s"]);
+        // A small change is noise.
+        changed.height_m[20..].fill(0.0);
+        gate.observe(Duration::from_secs(7), changed);
+        assert!(matches!(approve(&mut gate, 7), Verdict::Move(_)));
+    }
+
+    #[test]
+    fn an_approval_waits_for_the_heightmap_that_the_proposal_was_made_from() {
+        let mut gate = gate();
+        let mut early = proposal(8);
+        early.stamp = Duration::from_secs(6);
+        gate.propose(early).unwrap();
+        let verdict = approve(&mut gate, 8);
+        assert!(
+            matches!(&verdict, Verdict::Wait(r) if r.contains("6.000 s")),
+            "{verdict:?}"
+        );
+        gate.observe(Duration::from_secs(6), Heightmap::new(Workspace::RAVENS));
+        assert!(matches!(approve(&mut gate, 8), Verdict::Move(_)));
+    }
+
+    #[test]
+    fn an_observation_from_before_the_last_motion_is_no_ground_to_move() {
+        let mut gate = gate();
+        assert!(matches!(approve(&mut gate, 7), Verdict::Move(_)));
+        gate.finish(Duration::from_secs(9));
+        gate.propose(proposal(8)).unwrap();
+        let verdict = approve(&mut gate, 8);
+        assert_refused(&gate, verdict, &["8", "5.000 s", "9.000 s"]);
+    }
+
+    #[test]
+    fn a_stale_status_or_a_protective_stop_moves_nothing_and_the_proposal_stays_open() {
+        let mut gate = gate();
+        let late = NOW + Duration::from_secs(3);
+        let verdict = gate.confirm(7, Decision::Approve, &ready(NOW), late, |_, _| Ok(()));
+        assert_refused(&gate, verdict, &["7", "joint_states", "3.0 s"]);
+        let stopped = DriverStatus {
+            safety_mode: Some(3),
+            ..ready(NOW)
+        };
+        let verdict = gate.confirm(7, Decision::Approve, &stopped, NOW, |_, _| Ok(()));
+        assert_refused(&gate, verdict, &["7", "PROTECTIVE_STOP"]);
+        let verdict = gate.confirm(
+            7,
+            Decision::Approve,
+            &DriverStatus::default(),
+            NOW,
+            |_, _| Ok(()),
+        );
+        assert_refused(&gate, verdict, &["7", "robot mode"]);
+        assert!(matches!(approve(&mut gate, 7), Verdict::Move(_)));
+    }
+
+    #[test]
+    fn a_motion_that_cannot_be_planned_is_refused() {
+        let mut gate = gate();
+        let verdict = gate.confirm(7, Decision::Approve, &ready(NOW), NOW, |_, proposal| {
+            Err(format!(
+                "{} is out of reach",
+                proposal.action.pick.translation.x
+            ))
+        });
+        assert_refused(&gate, verdict, &["7", "0.4 is out of reach"]);
+    }
+
+    #[test]
+    fn a_stop_cancels_the_motion_whatever_proposal_it_names() {
+        for id in [7, 99] {
+            let mut gate = gate();
+            assert!(matches!(approve(&mut gate, 7), Verdict::Move(_)));
+            assert_eq!(decide(&mut gate, id, Decision::Stop), Verdict::Cancel);
+            assert_eq!(gate.moving(), Some(7));
+        }
+    }
+
+    #[test]
+    fn a_stop_while_nothing_moves_withdraws_the_proposal() {
+        let mut gate = gate();
+        let verdict = decide(&mut gate, 7, Decision::Stop);
+        assert!(
+            matches!(verdict, Verdict::Answer(Answer::Stopped, _)),
+            "{verdict:?}"
+        );
+        let verdict = approve(&mut gate, 7);
+        assert_refused(&gate, verdict, &["7", "withdrawn"]);
+        // Said again, or after a result, it is not news.
+        assert_eq!(decide(&mut gate, 7, Decision::Stop), Verdict::Nothing);
+        let verdict = decide(&mut gate, 99, Decision::Stop);
+        assert_refused(&gate, verdict, &["99", "unknown"]);
+    }
+
+    #[test]
+    fn memory_is_bounded() {
+        let mut gate = gate();
+        for id in 0..10_000 {
+            let _ = gate.propose(proposal(id));
+            gate.observe(Duration::from_millis(id), Heightmap::new(Workspace::RAVENS));
+        }
+        assert_eq!(gate.fates.len(), PROPOSALS);
+        assert_eq!(gate.heightmaps.len(), HEIGHTMAPS);
+    }
+}

@@ -51,7 +51,7 @@ def _starter(request: pytest.FixtureRequest, domain: int, log_directory: pathlib
     yield start
     for process in reversed(processes):
         process.end()
-        print(f"--- end of the log of {process.name} (exit code {process.exit_code})\n{process.log()[-4000:]}")
+        print(f"--- {process.name} (exit code {process.exit_code})\n{process.log()}")
 
 
 @pytest.fixture

@@ -55,24 +55,25 @@ def environment(domain: int) -> dict[str, str]:
 
 
 class Process:
-    """One running executable with its output in a file."""
+    """One running executable, its output in files."""
 
     def __init__(self, name: str, arguments: list[str], domain: int, log_directory: pathlib.Path) -> None:
         self.name = name
         executable = BINARIES / name
         if not executable.exists():
             raise FileNotFoundError(f"{executable}: build first, `cargo build --release --workspace --bins`")
-        number = len(list(log_directory.glob(f"{name}*.log")))
-        self.log_file = log_directory / f"{name}-{number}.log"
-        with self.log_file.open("wb") as log:
+        number = len(list(log_directory.glob(f"{name}-*.out")))
+        self._output_file = log_directory / f"{name}-{number}.out"
+        self._error_file = log_directory / f"{name}-{number}.err"
+        with self._output_file.open("wb") as output, self._error_file.open("wb") as errors:
             # Its own session: whatever it starts can be found and ended with it.
             self._child = subprocess.Popen(
                 [executable, *map(str, arguments)],
                 cwd=REPOSITORY,
                 env=environment(domain),
                 stdin=subprocess.DEVNULL,
-                stdout=log,
-                stderr=subprocess.STDOUT,
+                stdout=output,
+                stderr=errors,
                 start_new_session=True,
             )
 
@@ -84,15 +85,24 @@ class Process:
     def exit_code(self) -> int | None:
         return self._child.poll()
 
+    def output(self) -> str:
+        """Standard output so far."""
+        return self._output_file.read_text(errors="replace")
+
+    def errors(self) -> str:
+        """Standard error so far: the log."""
+        return self._error_file.read_text(errors="replace")
+
     def log(self) -> str:
-        return self.log_file.read_text(errors="replace")
+        """The ends of both, for a person to read."""
+        return f"...{self.output()[-1000:]}\n...{self.errors()[-4000:]}"
 
     def wait(self, timeout_s: float) -> int:
         """The exit code; an error with the end of the log when it is still running after the time."""
         try:
             return self._child.wait(timeout_s)
         except subprocess.TimeoutExpired:
-            raise TimeoutError(f"{self.name} still runs after {timeout_s} s; its log ends:\n{self.log()[-3000:]}") from None
+            raise TimeoutError(f"{self.name} still runs after {timeout_s} s; its output ends:\n{self.log()}") from None
 
     def descendants(self) -> list[int]:
         """Living processes of its session, itself included; zombies do not count."""

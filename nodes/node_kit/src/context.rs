@@ -1,0 +1,353 @@
+//! One DDS participant, and the nodes that share it.
+
+use std::{
+    env,
+    net::{IpAddr, Ipv4Addr},
+    process::ExitCode,
+    time::Duration,
+};
+
+use anyhow::Context as _;
+use rustdds::DomainParticipantBuilder;
+use tokio::task::JoinHandle;
+use tokio_util::sync::CancellationToken;
+use tracing::{Instrument, error, info};
+
+use crate::{
+    arguments::RosArguments,
+    logging,
+    node::Node,
+    parameters::{self, Parameters},
+};
+
+/// How long a node that watches for shutdown may take.
+const GRACE: Duration = Duration::from_secs(2);
+
+/// Where to look for other nodes.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Network {
+    /// ROS_DOMAIN_ID.
+    pub domain_id: u16,
+    /// Nothing leaves this host.
+    pub localhost_only: bool,
+}
+
+/// Why there is no participant.
+#[derive(Debug, thiserror::Error)]
+pub enum ContextError {
+    /// An environment variable makes no sense.
+    #[error("environment variable {name}={value}: expected {expected}")]
+    Environment {
+        /// Its name.
+        name: &'static str,
+        /// Its value.
+        value: String,
+        /// What it may be.
+        expected: &'static str,
+    },
+    /// The middleware refused.
+    #[error("DDS participant in domain {domain_id}: {reason}")]
+    Middleware {
+        /// The domain.
+        domain_id: u16,
+        /// Why.
+        reason: String,
+    },
+}
+
+impl Network {
+    /// As ROS 2 reads the environment: ROS_DOMAIN_ID, ROS_AUTOMATIC_DISCOVERY_RANGE (SUBNET,
+    /// LOCALHOST, SYSTEM_DEFAULT) and the older ROS_LOCALHOST_ONLY.
+    pub fn from_environment() -> Result<Self, ContextError> {
+        Self::from_variables(|name| env::var(name).ok())
+    }
+
+    fn from_variables(read: impl Fn(&str) -> Option<String>) -> Result<Self, ContextError> {
+        let bad = |name, value: &str, expected| ContextError::Environment {
+            name,
+            value: value.to_owned(),
+            expected,
+        };
+        let domain_id = match read("ROS_DOMAIN_ID").as_deref() {
+            None | Some("") => 0,
+            // Above 232 the port numbers of DDS overflow.
+            Some(text) => text
+                .parse()
+                .ok()
+                .filter(|id| *id <= 232)
+                .ok_or_else(|| bad("ROS_DOMAIN_ID", text, "an integer from 0 to 232"))?,
+        };
+        let range = read("ROS_AUTOMATIC_DISCOVERY_RANGE");
+        let localhost_only = match range.as_deref() {
+            Some("LOCALHOST") => true,
+            Some("SUBNET" | "SYSTEM_DEFAULT") => false,
+            None | Some("") => match read("ROS_LOCALHOST_ONLY").as_deref() {
+                Some("1") => true,
+                None | Some("" | "0") => false,
+                Some(other) => return Err(bad("ROS_LOCALHOST_ONLY", other, "0 or 1")),
+            },
+            Some(other) => {
+                return Err(bad(
+                    "ROS_AUTOMATIC_DISCOVERY_RANGE",
+                    other,
+                    "SUBNET, LOCALHOST or SYSTEM_DEFAULT (OFF is not supported)",
+                ));
+            }
+        };
+        Ok(Self {
+            domain_id,
+            localhost_only,
+        })
+    }
+}
+
+/// One DDS participant. Nodes of one process share it, as discovery probes only a dozen
+/// participants per host.
+#[derive(Clone)]
+pub struct Context {
+    ros: ros2_client::Context,
+    shutdown: CancellationToken,
+}
+
+impl Context {
+    /// Joins a domain.
+    pub fn new(network: Network) -> Result<Self, ContextError> {
+        let Network {
+            domain_id,
+            localhost_only,
+        } = network;
+        let middleware = |reason: String| ContextError::Middleware { domain_id, reason };
+        let mut builder = DomainParticipantBuilder::new(domain_id);
+        if localhost_only {
+            builder = builder.with_only_networks([IpAddr::V4(Ipv4Addr::LOCALHOST)]);
+        }
+        let participant = builder
+            .build()
+            .map_err(|error| middleware(format!("{error:?}")))?;
+        let ros = ros2_client::Context::from_domain_participant(participant)
+            .map_err(|error| middleware(error.to_string()))?;
+        Ok(Self {
+            ros,
+            shutdown: CancellationToken::new(),
+        })
+    }
+
+    /// Makes a node and reads its parameters.
+    pub fn node<P: Parameters>(
+        &self,
+        default_name: &str,
+        arguments: &RosArguments,
+    ) -> anyhow::Result<(Node, P)> {
+        let name = arguments.node_name(default_name);
+        let namespace = arguments.namespace(default_name).trim_matches('/');
+        let full_name = format!("/{namespace}/{name}").replace("//", "/");
+        let loaded = parameters::load::<P>(&arguments.parameters, default_name, &full_name)?;
+        let node = Node::new(
+            self,
+            default_name,
+            arguments,
+            loaded.use_sim_time,
+            loaded.declared,
+        )?;
+        Ok((node, loaded.parameters))
+    }
+
+    /// Makes a node and runs it as a task, until it ends or the context shuts down.
+    pub fn start<P, F>(
+        &self,
+        default_name: &str,
+        arguments: &RosArguments,
+        run: impl FnOnce(Node, P) -> F,
+    ) -> anyhow::Result<JoinHandle<anyhow::Result<()>>>
+    where
+        P: Parameters,
+        F: Future<Output = anyhow::Result<()>> + Send + 'static,
+    {
+        let (node, parameters) = self
+            .node::<P>(default_name, arguments)
+            .with_context(|| format!("node {default_name}"))?;
+        let running = run(node.clone(), parameters);
+        let span = node.span().clone();
+        Ok(tokio::spawn(supervise(node, running).instrument(span)))
+    }
+
+    /// Cancelled when all nodes of this context are to end.
+    pub fn shutdown_token(&self) -> &CancellationToken {
+        &self.shutdown
+    }
+
+    /// Ends all nodes of this context.
+    pub fn shutdown(&self) {
+        logging::shutting_down();
+        self.shutdown.cancel();
+    }
+
+    pub(crate) fn ros(&self) -> &ros2_client::Context {
+        &self.ros
+    }
+}
+
+/// Runs a node to its end, or to the shutdown's.
+async fn supervise(
+    node: Node,
+    running: impl Future<Output = anyhow::Result<()>>,
+) -> anyhow::Result<()> {
+    tokio::pin!(running);
+    let result = tokio::select! {
+        result = &mut running => result,
+        () = node.shutdown_token().cancelled() => {
+            if node.observes_shutdown() {
+                tokio::time::timeout(GRACE, running).await.unwrap_or_else(|_| {
+                    Err(anyhow::anyhow!("not finished {GRACE:?} after shutdown"))
+                })
+            } else {
+                Ok(())
+            }
+        }
+    };
+    if let Err(error) = &result {
+        error!("{error:#}");
+    }
+    node.stop();
+    result
+}
+
+/// The `main` of a node's own executable: ROS arguments, participant, node, and a clean end on
+/// SIGINT and SIGTERM.
+///
+/// `--parameters` prints the parameters with their defaults. With the environment variable
+/// NODE_KIT_EXIT_WITH_PARENT=1 the node ends when the process that started it is gone.
+pub fn main<P, F>(
+    default_name: &'static str,
+    run: impl FnOnce(Node, P) -> F + Send + 'static,
+) -> ExitCode
+where
+    P: Parameters,
+    F: Future<Output = anyhow::Result<()>> + Send + 'static,
+{
+    match run_main(default_name, run) {
+        Ok(()) => ExitCode::SUCCESS,
+        Err(error) => {
+            eprintln!("{default_name}: {error:#}");
+            ExitCode::FAILURE
+        }
+    }
+}
+
+fn run_main<P, F>(
+    default_name: &'static str,
+    run: impl FnOnce(Node, P) -> F + Send + 'static,
+) -> anyhow::Result<()>
+where
+    P: Parameters,
+    F: Future<Output = anyhow::Result<()>> + Send + 'static,
+{
+    let (arguments, others) = RosArguments::parse(env::args().skip(1))?;
+    match others.first().map(String::as_str) {
+        None => {}
+        Some("--parameters") => {
+            print!("{}", serde_yaml_ng::to_string(&P::default())?);
+            return Ok(());
+        }
+        Some(other) => anyhow::bail!(
+            "unknown argument {other:?}; usage: {default_name} [--parameters] [--ros-args -r FROM:=TO \
+             -p NAME:=VALUE --params-file FILE --log-level LEVEL]"
+        ),
+    }
+    logging::init(&arguments.log_levels)?;
+    let network = Network::from_environment()?;
+    let runtime = tokio::runtime::Builder::new_multi_thread()
+        .enable_all()
+        .build()
+        .context("tokio runtime")?;
+    let result = runtime.block_on(async {
+        let context = Context::new(network)?;
+        let ended = context.start(default_name, &arguments, run)?;
+        let signalled = tokio::spawn({
+            let context = context.clone();
+            async move {
+                wait_for_end().await?;
+                context.shutdown();
+                anyhow::Ok(())
+            }
+        });
+        let result = ended.await.context("node panicked")?;
+        context.shutdown();
+        signalled.abort();
+        result
+    });
+    // Blocking work (a network, a simulation step) is not waited for.
+    runtime.shutdown_timeout(Duration::from_millis(500));
+    result
+}
+
+/// Waits for SIGINT, SIGTERM, or, where asked for, the end of the parent process.
+pub async fn wait_for_end() -> anyhow::Result<()> {
+    use tokio::signal::unix::{SignalKind, signal};
+    let mut terminate = signal(SignalKind::terminate()).context("SIGTERM")?;
+    let with_parent = env::var("NODE_KIT_EXIT_WITH_PARENT").is_ok_and(|value| value == "1");
+    tokio::select! {
+        result = tokio::signal::ctrl_c() => {
+            result.context("SIGINT")?;
+            info!("SIGINT: shutting down");
+        }
+        _ = terminate.recv() => info!("SIGTERM: shutting down"),
+        () = parent_gone(), if with_parent => info!("parent process is gone: shutting down"),
+    }
+    Ok(())
+}
+
+async fn parent_gone() {
+    let parent = std::os::unix::process::parent_id();
+    while std::os::unix::process::parent_id() == parent {
+        tokio::time::sleep(Duration::from_millis(500)).await;
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn network(variables: &[(&str, &str)]) -> Result<Network, ContextError> {
+        Network::from_variables(|name| {
+            variables
+                .iter()
+                .find(|(key, _)| *key == name)
+                .map(|(_, value)| (*value).to_owned())
+        })
+    }
+
+    #[test]
+    fn the_environment_is_read_as_ros_does() {
+        assert_eq!(network(&[]).unwrap(), Network::default());
+        let set = network(&[
+            ("ROS_DOMAIN_ID", "42"),
+            ("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST"),
+        ]);
+        assert_eq!(
+            set.unwrap(),
+            Network {
+                domain_id: 42,
+                localhost_only: true
+            }
+        );
+        assert!(
+            network(&[("ROS_LOCALHOST_ONLY", "1")])
+                .unwrap()
+                .localhost_only
+        );
+    }
+
+    #[test]
+    fn nonsense_in_the_environment_is_refused_by_name() {
+        for (name, value) in [
+            ("ROS_DOMAIN_ID", "233"),
+            ("ROS_DOMAIN_ID", "one"),
+            ("ROS_AUTOMATIC_DISCOVERY_RANGE", "HOME"),
+            ("ROS_LOCALHOST_ONLY", "yes"),
+        ] {
+            let text = network(&[(name, value)]).unwrap_err().to_string();
+            assert!(text.contains(name) && text.contains(value), "{text}");
+        }
+    }
+}

@@ -1,0 +1,105 @@
+//! The QoS profiles of the system; nothing bypasses them.
+
+use ros2_client::qos::{Durability, History, QosProfile, WhenFull};
+use rustdds::{QosPolicies, QosPolicyBuilder, policy};
+
+/// How a topic is delivered (REP-2003, and the design's choices).
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Qos {
+    /// Camera images and other large streams: best effort, volatile, depth 4. A lost image is
+    /// replaced by the next; a slow reader costs the writer nothing.
+    Image,
+    /// State that a late joiner must have (heightmap, goal, tf_static, robot mode): reliable,
+    /// transient local, depth 1.
+    Latched,
+    /// Things that happen once (confirmations, proposals, results) and small streams: reliable,
+    /// volatile, so that nothing is replayed to a late joiner.
+    Event,
+    /// Requests and replies of services and actions: reliable, volatile.
+    Service,
+}
+
+impl Qos {
+    /// As DDS policies. The resource limit bounds RustDDS's cache, which otherwise keeps 64
+    /// samples of every topic: 400 MB for six camera topics.
+    pub(crate) fn policies(self) -> QosPolicies {
+        let infinite = rustdds::Duration::INFINITE;
+        let builder = QosPolicyBuilder::new()
+            .deadline(policy::Deadline(infinite))
+            .lifespan(policy::Lifespan { duration: infinite })
+            .liveliness(policy::Liveliness::Automatic {
+                lease_duration: infinite,
+            });
+        let builder = match self {
+            Self::Image => builder.best_effort(),
+            // A publisher waits this long for readers that do not keep up, then the sample is
+            // counted as dropped.
+            Self::Latched | Self::Event | Self::Service => {
+                builder.reliable(rustdds::Duration::from_millis(100))
+            }
+        };
+        builder
+            .durability(match self {
+                Self::Latched => policy::Durability::TransientLocal,
+                _ => policy::Durability::Volatile,
+            })
+            .history(policy::History::KeepLast {
+                depth: self.depth(),
+            })
+            .resource_limits(policy::ResourceLimits {
+                max_samples: self.limit(),
+                max_instances: 1,
+                max_samples_per_instance: self.limit(),
+            })
+            .build()
+    }
+
+    /// For services and actions, which ros2-client creates from its own profile type.
+    pub(crate) fn profile(self) -> QosProfile {
+        QosProfile::publisher_default()
+            .reliability_reliable(WhenFull::DEFAULT)
+            .durability(match self {
+                Self::Latched => Durability::TransientLocal,
+                _ => Durability::Volatile,
+            })
+            .history(History::KeepLast {
+                depth: self.depth() as usize,
+            })
+    }
+
+    const fn depth(self) -> i32 {
+        match self {
+            Self::Image => 4,
+            Self::Latched => 1,
+            Self::Event | Self::Service => 64,
+        }
+    }
+
+    const fn limit(self) -> i32 {
+        match self {
+            Self::Image | Self::Latched => 8,
+            Self::Event | Self::Service => 256,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn only_latched_topics_are_replayed_to_late_joiners() {
+        for qos in [Qos::Image, Qos::Event, Qos::Service] {
+            assert!(qos.policies().is_volatile(), "{qos:?}");
+        }
+        assert!(!Qos::Latched.policies().is_volatile());
+    }
+
+    #[test]
+    fn only_images_are_best_effort() {
+        assert!(!Qos::Image.policies().is_reliable());
+        for qos in [Qos::Latched, Qos::Event, Qos::Service] {
+            assert!(qos.policies().is_reliable(), "{qos:?}");
+        }
+    }
+}

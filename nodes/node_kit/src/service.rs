@@ -1,0 +1,199 @@
+//! Services, with retries on the client's side: the first reply may be lost while the two ends are
+//! still discovering each other, so servers must be idempotent.
+
+use std::{sync::Arc, time::Duration};
+
+use ros2_client::{RmwRequestId, service::CallServiceError};
+use tokio::{sync::Mutex, time::timeout};
+use tracing::debug;
+
+use msgs::Service;
+
+use crate::{graph::Graph, statistics::Statistics};
+
+/// How often and how long a call is tried.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct CallOptions {
+    /// Number of times that the request is sent.
+    pub attempts: u32,
+    /// Wait for the reply of one attempt.
+    pub timeout: Duration,
+}
+
+impl Default for CallOptions {
+    fn default() -> Self {
+        Self {
+            attempts: 5,
+            timeout: Duration::from_secs(1),
+        }
+    }
+}
+
+/// Why a call brought no answer.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+pub enum CallError {
+    /// No server was discovered.
+    #[error("{name}: no server within {waited:?}")]
+    Unavailable {
+        /// Service or action.
+        name: String,
+        /// How long.
+        waited: Duration,
+    },
+    /// The server did not answer.
+    #[error("{name}: no reply to {attempts} requests, {timeout:?} each")]
+    NoReply {
+        /// Service or action.
+        name: String,
+        /// Requests sent.
+        attempts: u32,
+        /// Wait for each.
+        timeout: Duration,
+    },
+    /// The middleware refused the request, or the reply could not be read.
+    #[error("{name}: {reason}")]
+    Middleware {
+        /// Service or action.
+        name: String,
+        /// Why.
+        reason: String,
+    },
+    /// The action server does not want this goal.
+    #[error("{name}: goal rejected")]
+    Rejected {
+        /// Action.
+        name: String,
+    },
+}
+
+/// Tries a call several times; each attempt has its own request id, and an answer to any earlier
+/// one is ignored.
+pub(crate) async fn attempt<T, F>(
+    name: &str,
+    options: &CallOptions,
+    mut call: impl FnMut() -> F,
+) -> Result<T, CallError>
+where
+    F: Future<Output = Result<T, CallServiceError<()>>>,
+{
+    let mut last = None;
+    for number in 1..=options.attempts {
+        match timeout(options.timeout, call()).await {
+            Ok(Ok(reply)) => return Ok(reply),
+            Ok(Err(error)) => last = Some(error.to_string()),
+            Err(_) => debug!("{name}: no reply to request {number}"),
+        }
+    }
+    Err(match last {
+        Some(reason) => CallError::Middleware {
+            name: name.to_owned(),
+            reason,
+        },
+        None => CallError::NoReply {
+            name: name.to_owned(),
+            attempts: options.attempts,
+            timeout: options.timeout,
+        },
+    })
+}
+
+/// Calls a service. One call at a time; others wait.
+pub struct ServiceClient<S: Service> {
+    client: Mutex<ros2_client::Client<S::Request, S::Response>>,
+    graph: Graph,
+    name: String,
+}
+
+impl<S: Service> ServiceClient<S> {
+    pub(crate) fn new(
+        client: ros2_client::Client<S::Request, S::Response>,
+        graph: Graph,
+        name: String,
+    ) -> Self {
+        Self {
+            client: Mutex::new(client),
+            graph,
+            name,
+        }
+    }
+
+    /// Waits until a server is discovered.
+    pub async fn wait_for_server(&self, limit: Duration) -> Result<(), CallError> {
+        self.graph.wait_for_service(&self.name, limit).await
+    }
+
+    /// Sends the request, again if no reply comes.
+    pub async fn call(
+        &self,
+        request: &S::Request,
+        options: &CallOptions,
+    ) -> Result<S::Response, CallError> {
+        let client = self.client.lock().await;
+        attempt(&self.name, options, || {
+            client.async_call_service(request.clone())
+        })
+        .await
+    }
+
+    /// Absolute name of the service.
+    pub fn name(&self) -> &str {
+        &self.name
+    }
+}
+
+/// Answers a service.
+pub struct ServiceServer<S: Service> {
+    server: ros2_client::Server<S::Request, S::Response>,
+    statistics: Arc<Statistics>,
+}
+
+/// Which request a response answers.
+#[derive(Clone, Copy, Debug)]
+pub struct RequestId(RmwRequestId);
+
+impl<S: Service> ServiceServer<S> {
+    pub(crate) fn new(
+        server: ros2_client::Server<S::Request, S::Response>,
+        statistics: Arc<Statistics>,
+    ) -> Self {
+        Self { server, statistics }
+    }
+
+    /// The next request. Requests that cannot be decoded are counted, warned about and skipped.
+    pub async fn recv(&mut self) -> (RequestId, S::Request) {
+        loop {
+            match self.server.async_receive_request().await {
+                Ok((id, request)) => {
+                    self.statistics.count_message();
+                    return (RequestId(id), request);
+                }
+                Err(error) => {
+                    self.statistics.reject(error);
+                    tokio::time::sleep(Duration::from_millis(1)).await;
+                }
+            }
+        }
+    }
+
+    /// Answers a request.
+    pub fn respond(&self, id: RequestId, response: S::Response) {
+        if let Err(error) = self.server.send_response(id.0, response) {
+            self.statistics
+                .reject(format_args!("response not sent: {error}"));
+        }
+    }
+
+    /// Answers all requests, one after the other, for ever. Requests may come twice: `answer` must
+    /// be idempotent.
+    pub async fn serve(mut self, mut answer: impl FnMut(S::Request) -> S::Response) {
+        loop {
+            let (id, request) = self.recv().await;
+            self.respond(id, answer(request));
+        }
+    }
+
+    /// The counters of this service.
+    pub fn statistics(&self) -> &Arc<Statistics> {
+        &self.statistics
+    }
+}

@@ -1,0 +1,341 @@
+//! Topics, services, actions, time, parameters, rosout and diagnostics over real DDS on loopback.
+
+use std::time::Duration;
+
+use msgs::{
+    Action, Interface, Service,
+    control_msgs::{FollowJointTrajectoryGoal, FollowJointTrajectoryResult},
+    diagnostic_msgs::DiagnosticArray,
+    rosgraph_msgs::Clock,
+    sensor_msgs::Image,
+    std_msgs::Header,
+    ur_msgs::{SetIORequest, SetIOResponse},
+};
+use node_kit::{
+    ActionServer, CallOptions, Context, GoalStatus, Network, Node, Parameters, Qos, RosArguments,
+};
+use serde::{Deserialize, Serialize};
+use tokio::time::timeout;
+
+type FollowJointTrajectory = msgs::control_msgs::FollowJointTrajectory;
+type SetIO = msgs::ur_msgs::SetIO;
+
+#[derive(Default, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+struct NoParameters {}
+impl Parameters for NoParameters {}
+
+const LIMIT: Duration = Duration::from_secs(20);
+
+fn context(domain_id: u16) -> Context {
+    Context::new(Network {
+        domain_id,
+        localhost_only: true,
+    })
+    .expect("participant")
+}
+
+fn node(context: &Context, name: &str, arguments: &str) -> Node {
+    let words = arguments.split_whitespace().map(str::to_owned);
+    let (arguments, _) = RosArguments::parse(words).expect("arguments");
+    context
+        .node::<NoParameters>(name, &arguments)
+        .expect("node")
+        .0
+}
+
+fn image(number: u32) -> Image {
+    Image {
+        header: Header {
+            frame_id: "front".into(),
+            ..Header::default()
+        },
+        height: 480,
+        width: 640,
+        encoding: "rgb8".into(),
+        step: 1920,
+        data: vec![number as u8; 480 * 1920].into(),
+        ..Image::default()
+    }
+}
+
+async fn images_arrive(sender: &Node, receiver: &Node) {
+    let publisher = sender.publisher::<Image>("color", Qos::Image).unwrap();
+    let mut subscription = receiver.subscription::<Image>("color", Qos::Image).unwrap();
+    let sending = tokio::spawn(async move {
+        for number in 0..600 {
+            publisher.publish(image(number));
+            tokio::time::sleep(Duration::from_millis(33)).await;
+        }
+    });
+    for _ in 0..5 {
+        let image = timeout(LIMIT, subscription.recv()).await.expect("an image");
+        assert_eq!(image.data.len(), 480 * 1920);
+    }
+    sending.abort();
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn images_arrive_in_the_same_participant_and_in_another() {
+    let (one, two) = (context(41), context(41));
+    let sender = node(&one, "sender", "");
+    images_arrive(&sender, &node(&one, "same", "")).await;
+    images_arrive(&sender, &node(&two, "other", "")).await;
+}
+
+async fn late_joiner_has(sender: &Node, receiver: &Node, topic: &str) {
+    let publisher = sender.publisher::<Header>(topic, Qos::Latched).unwrap();
+    for frame_id in ["old", "new"] {
+        publisher.publish(Header {
+            frame_id: frame_id.into(),
+            ..Header::default()
+        });
+    }
+    tokio::time::sleep(Duration::from_millis(300)).await;
+    let mut subscription = receiver
+        .subscription::<Header>(topic, Qos::Latched)
+        .unwrap();
+    timeout(LIMIT, async {
+        while subscription.recv().await.frame_id != "new" {}
+    })
+    .await
+    .expect("the newest latched message");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_latched_message_reaches_a_late_joiner() {
+    let (one, two) = (context(42), context(42));
+    let sender = node(&one, "sender", "");
+    late_joiner_has(&sender, &node(&one, "same", ""), "goal_a").await;
+    late_joiner_has(&sender, &node(&two, "other", ""), "goal_b").await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_message_of_another_type_is_counted_and_the_next_one_is_read() {
+    let context = context(43);
+    let (sender, receiver) = (node(&context, "sender", ""), node(&context, "receiver", ""));
+    // Another type on the same topic: its bytes cannot be an image.
+    let wrong = sender
+        .publisher::<msgs::std_msgs::Float64>("x", Qos::Event)
+        .unwrap();
+    let right = sender.publisher::<Image>("x", Qos::Event).unwrap();
+    let mut subscription = receiver.subscription::<Image>("x", Qos::Event).unwrap();
+    assert!(sender.graph().wait_for_subscription("/x", LIMIT).await);
+    let statistics = subscription.statistics().clone();
+    let sending = tokio::spawn(async move {
+        loop {
+            wrong.publish(msgs::std_msgs::Float64 { data: 1e300 });
+            right.publish(image(1));
+            tokio::time::sleep(Duration::from_millis(50)).await;
+        }
+    });
+    timeout(LIMIT, async {
+        while statistics.snapshot().errors == 0 || statistics.snapshot().messages < 3 {
+            subscription.recv().await;
+        }
+    })
+    .await
+    .expect("errors counted and images read");
+    sending.abort();
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn services_answer_within_a_participant_and_across() {
+    let (one, two) = (context(44), context(44));
+    let server = node(&one, "server", "");
+    let service = server.service_server::<SetIO>("set_io").unwrap();
+    let serving = server.spawn(service.serve(|request: SetIORequest| SetIOResponse {
+        success: request.pin == 16,
+    }));
+    for client in [node(&one, "same", ""), node(&two, "other", "")] {
+        let client = client.service_client::<SetIO>("set_io").unwrap();
+        client.wait_for_server(LIMIT).await.unwrap();
+        for pin in [16, 3, 16] {
+            let request = SetIORequest {
+                fun: 1,
+                pin,
+                state: 1.0,
+            };
+            let reply = client
+                .call(&request, &CallOptions::default())
+                .await
+                .unwrap();
+            assert_eq!(reply.success, pin == 16);
+        }
+    }
+    drop(serving);
+    assert_eq!(SetIO::NAME, "SetIO");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_call_without_server_says_so() {
+    let context = context(45);
+    let client = node(&context, "client", "")
+        .service_client::<SetIO>("set_io")
+        .unwrap();
+    let error = client
+        .wait_for_server(Duration::from_millis(100))
+        .await
+        .unwrap_err();
+    assert!(error.to_string().contains("/set_io: no server"), "{error}");
+}
+
+/// Goals of tolerance 1 succeed, of tolerance 2 are rejected, others run until cancelled.
+async fn carry_out(mut server: ActionServer<FollowJointTrajectory>) {
+    loop {
+        let goal = server.recv().await;
+        match goal.goal.goal_time_tolerance.sec {
+            1 => {
+                let (_, running) = goal.accept();
+                running.succeed(FollowJointTrajectoryResult {
+                    error_string: "done".into(),
+                    ..Default::default()
+                });
+            }
+            2 => goal.reject("tolerance 2"),
+            _ => {
+                let (_, running) = goal.accept();
+                tokio::spawn(async move {
+                    running.cancel_requested().await;
+                    running.cancelled(FollowJointTrajectoryResult::default());
+                });
+            }
+        }
+    }
+}
+
+fn trajectory(kind: i32) -> FollowJointTrajectoryGoal {
+    let mut goal = FollowJointTrajectoryGoal::default();
+    goal.goal_time_tolerance.sec = kind;
+    goal
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn actions_run_side_by_side_and_end_as_they_should() {
+    let (one, two) = (context(46), context(46));
+    let server_node = node(&one, "server", "");
+    let server = server_node
+        .action_server::<FollowJointTrajectory>("controller/follow")
+        .unwrap();
+    server_node.spawn(carry_out(server));
+    let options = CallOptions::default();
+    for client_node in [node(&one, "same", ""), node(&two, "other", "")] {
+        let client = client_node
+            .action_client::<FollowJointTrajectory>("controller/follow")
+            .unwrap();
+        client.wait_for_server(LIMIT).await.unwrap();
+
+        // Three at once: the long ones do not block the short one.
+        let long = client.send_goal(&trajectory(3), &options).await.unwrap();
+        let longer = client.send_goal(&trajectory(3), &options).await.unwrap();
+        let short = client.send_goal(&trajectory(1), &options).await.unwrap();
+        let (status, result) = timeout(LIMIT, short.result()).await.unwrap().unwrap();
+        assert_eq!(status, GoalStatus::Succeeded);
+        assert_eq!(result.error_string, "done");
+
+        let (_, cancelled) = tokio::join!(
+            async {
+                tokio::time::sleep(Duration::from_millis(200)).await;
+                long.cancel(&options).await.unwrap();
+            },
+            timeout(LIMIT, long.result())
+        );
+        assert_eq!(cancelled.unwrap().unwrap().0, GoalStatus::Canceled);
+        longer.cancel(&options).await.unwrap();
+        let (status, _) = timeout(LIMIT, longer.result()).await.unwrap().unwrap();
+        assert_eq!(status, GoalStatus::Canceled);
+        // A late request for a result still gets it.
+        let (status, _) = timeout(LIMIT, short.result()).await.unwrap().unwrap();
+        assert_eq!(status, GoalStatus::Succeeded);
+
+        let Err(error) = client.send_goal(&trajectory(2), &options).await else {
+            panic!("accepted");
+        };
+        assert!(error.to_string().contains("rejected"), "{error}");
+    }
+    assert_eq!(FollowJointTrajectory::NAME, "FollowJointTrajectory");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn simulated_time_comes_from_the_clock_topic() {
+    let context = context(47);
+    let simulator = node(&context, "simulator", "");
+    let follower = node(&context, "follower", "--ros-args -p use_sim_time:=true");
+    let clock = simulator.publisher::<Clock>("/clock", Qos::Event).unwrap();
+    assert_eq!(follower.clock().now_ns(), 0);
+    timeout(LIMIT, async {
+        while follower.clock().now_ns() != 12_500_000_000 {
+            clock.publish(Clock {
+                clock: node_kit::stamp_from_ns(12_500_000_000),
+            });
+            tokio::time::sleep(Duration::from_millis(20)).await;
+        }
+    })
+    .await
+    .expect("simulated time");
+    assert!(!simulator.clock().is_simulated());
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn logs_reach_rosout_and_diagnostics_name_the_topics() {
+    node_kit::logging::init(&[]).unwrap();
+    let context = context(48);
+    let speaker = node(&context, "speaker", "--ros-args -r __ns:=/cell -r a:=b");
+    let listener = node(&context, "listener", "");
+    let _topic = speaker.publisher::<Header>("a", Qos::Event).unwrap();
+    let mut logs = listener
+        .subscription::<RosoutLog>("/rosout", Qos::Event)
+        .unwrap();
+    let mut diagnostics = listener
+        .subscription::<DiagnosticArray>("/diagnostics", Qos::Event)
+        .unwrap();
+    let speaking = speaker.spawn(async {
+        loop {
+            tracing::warn!(step = 3, "hello");
+            tokio::time::sleep(Duration::from_millis(50)).await;
+        }
+    });
+    timeout(LIMIT, async {
+        loop {
+            let log = logs.recv().await;
+            if log.name == "cell.speaker" && log.msg == "hello step=3" && log.level == 30 {
+                break;
+            }
+        }
+    })
+    .await
+    .expect("the log");
+    timeout(LIMIT, async {
+        loop {
+            let array = diagnostics.recv().await;
+            let mine = array
+                .status
+                .iter()
+                .find(|s| s.name == "/cell/speaker: topics");
+            if mine.is_some_and(|s| s.values.iter().any(|value| value.key == "/cell/b")) {
+                break;
+            }
+        }
+    })
+    .await
+    .expect("diagnostics");
+    speaking.abort();
+}
+
+/// rcl_interfaces/Log, which is not among our packages.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+struct RosoutLog {
+    stamp: msgs::builtin_interfaces::Time,
+    level: u8,
+    name: String,
+    msg: String,
+    file: String,
+    function: String,
+    line: u32,
+}
+impl ros2_client::Message for RosoutLog {}
+impl Interface for RosoutLog {
+    const TYPE_NAME: &'static str = "rcl_interfaces/msg/Log";
+    const DEFINITION: &'static str = "";
+    const TYPE_HASH: &'static str = "";
+}

@@ -1,6 +1,15 @@
-//! Checkpoints.
+//! Checkpoints: one safetensors file with the weights, and in its metadata the configuration and what its
+//! maker says about it. Nothing is ever unpickled.
 
-use std::collections::BTreeMap;
+use safetensors::SafeTensors;
+use safetensors::tensor::{Dtype, TensorView};
+use std::collections::{BTreeMap, HashMap};
+use std::io::Write;
+use std::path::{Path, PathBuf};
+use tch::{Kind, Tensor};
+
+use crate::network::Parameters;
+use crate::{Error, NetworkConfig};
 
 /// What the maker of a checkpoint says about it: title to text.
 pub type ModelCard = BTreeMap<String, String>;
@@ -12,4 +21,222 @@ pub enum Storage {
     F32,
     /// Rounded to 16-bit floats: half the size.
     F16,
+}
+
+const FORMAT: &str = "gctn-checkpoint";
+const VERSION: &str = "1";
+
+/// A file of this crate, read into memory.
+pub(crate) struct File {
+    path: PathBuf,
+    bytes: Vec<u8>,
+    metadata: HashMap<String, String>,
+}
+
+impl File {
+    /// Reads a file and checks that it is a whole one of the given format and version.
+    pub fn read(path: &Path, format: &str, version: &str) -> Result<Self, Error> {
+        let bytes = std::fs::read(path).map_err(|source| Error::Io {
+            path: path.into(),
+            source,
+        })?;
+        let file = Self {
+            path: path.into(),
+            metadata: HashMap::new(),
+            bytes,
+        };
+        let (_, header) = SafeTensors::read_metadata(&file.bytes).map_err(|error| {
+            file.error(format!("no safetensors file, or a truncated one: {error}"))
+        })?;
+        SafeTensors::deserialize(&file.bytes)
+            .map_err(|error| file.error(format!("a truncated safetensors file: {error}")))?;
+        let metadata = header.metadata().clone().unwrap_or_default();
+        let file = Self { metadata, ..file };
+        for (key, expected) in [("format", format), ("version", version)] {
+            let actual = file.text(key)?;
+            if actual != expected {
+                return Err(file.error(format!("{key} is {actual:?}, expected {expected:?}")));
+            }
+        }
+        Ok(file)
+    }
+
+    pub fn error(&self, problem: String) -> Error {
+        Error::Checkpoint {
+            path: self.path.clone(),
+            problem,
+        }
+    }
+
+    fn tensor_error(&self, tensor: &str, problem: String) -> Error {
+        Error::CheckpointTensor {
+            path: self.path.clone(),
+            tensor: tensor.into(),
+            problem,
+        }
+    }
+
+    /// A text of the metadata.
+    pub fn text(&self, key: &str) -> Result<&str, Error> {
+        let text = self.metadata.get(key).map(String::as_str);
+        text.ok_or_else(|| {
+            self.error(format!(
+                "no {key:?} in its metadata, so not made by this program"
+            ))
+        })
+    }
+
+    /// A value of the metadata that is JSON.
+    pub fn json<T: serde::de::DeserializeOwned>(&self, key: &str) -> Result<T, Error> {
+        serde_json::from_str(self.text(key)?)
+            .map_err(|error| self.error(format!("{key:?} in its metadata: {error}")))
+    }
+
+    /// Fills tensors from those of the same names. Refuses missing, further and misshapen ones, and
+    /// numbers that are not finite.
+    pub fn fill(&self, entries: &[(String, Tensor)]) -> Result<(), Error> {
+        let tensors =
+            SafeTensors::deserialize(&self.bytes).map_err(|error| self.error(error.to_string()))?;
+        let mut names = tensors.names();
+        names.sort_unstable();
+        if let Some(name) = names
+            .iter()
+            .find(|name| !entries.iter().any(|(known, _)| known == *name))
+        {
+            return Err(self.tensor_error(name, "the configured network has no such tensor".into()));
+        }
+        for (name, target) in entries {
+            let view = tensors.tensor(name).map_err(|_| {
+                self.tensor_error(name, "missing, though the configured network has it".into())
+            })?;
+            let shape: Vec<i64> = view.shape().iter().map(|size| *size as i64).collect();
+            if shape != target.size() {
+                let problem = format!("shape {shape:?}, expected {:?}", target.size());
+                return Err(self.tensor_error(name, problem));
+            }
+            let kind = match view.dtype() {
+                Dtype::F16 => Kind::Half,
+                Dtype::F32 => Kind::Float,
+                other => {
+                    return Err(
+                        self.tensor_error(name, format!("type {other:?}, expected F32 or F16"))
+                    );
+                }
+            };
+            let source =
+                Tensor::f_from_data_size(view.data(), &shape, kind)?.to_kind(target.kind());
+            if source.isfinite().all().int64_value(&[]) == 0 {
+                return Err(self.tensor_error(name, "has numbers that are not finite".into()));
+            }
+            tch::no_grad(|| target.shallow_clone().f_copy_(&source))?;
+        }
+        Ok(())
+    }
+}
+
+/// Writes tensors and metadata, so that the file appears whole or not at all.
+pub(crate) fn write(
+    path: &Path,
+    storage: Storage,
+    entries: &[(String, Tensor)],
+    metadata: HashMap<String, String>,
+) -> Result<(), Error> {
+    let (kind, dtype) = match storage {
+        Storage::F32 => (Kind::Float, Dtype::F32),
+        Storage::F16 => (Kind::Half, Dtype::F16),
+    };
+    let mut data = Vec::new();
+    for (name, tensor) in entries {
+        let tensor = tensor
+            .detach()
+            .to_kind(kind)
+            .to_device(tch::Device::Cpu)
+            .contiguous();
+        if tensor.isfinite().all().int64_value(&[]) == 0 {
+            return Err(Error::CheckpointTensor {
+                path: path.into(),
+                tensor: name.clone(),
+                problem: format!("not written: it has numbers that are not finite in {dtype:?}"),
+            });
+        }
+        let mut bytes = vec![0; tensor.numel() * kind.elt_size_in_bytes()];
+        tensor.f_copy_data_u8(&mut bytes, tensor.numel())?;
+        let shape: Vec<usize> = tensor.size().iter().map(|size| *size as usize).collect();
+        data.push((name.as_str(), shape, bytes));
+    }
+    let problem = |error: safetensors::SafeTensorError| Error::Checkpoint {
+        path: path.into(),
+        problem: error.to_string(),
+    };
+    let views: Vec<_> = data
+        .iter()
+        .map(|(name, shape, bytes)| Ok((*name, TensorView::new(dtype, shape.clone(), bytes)?)))
+        .collect::<Result<_, _>>()
+        .map_err(problem)?;
+    let bytes = safetensors::serialize(views, Some(metadata)).map_err(problem)?;
+    write_whole(path, &bytes).map_err(|source| Error::Io {
+        path: path.into(),
+        source,
+    })
+}
+
+/// Writes beside the file, then puts it in its place: a full disk leaves the old file as it was.
+fn write_whole(path: &Path, bytes: &[u8]) -> std::io::Result<()> {
+    let mut name = path.file_name().unwrap_or_default().to_owned();
+    name.push(".part");
+    let part = path.with_file_name(name);
+    let written = std::fs::File::create(&part).and_then(|mut file| {
+        file.write_all(bytes)?;
+        file.sync_all()
+    });
+    written
+        .and_then(|()| std::fs::rename(&part, path))
+        .inspect_err(|_| {
+            // The error that matters is the first one.
+            let _ = std::fs::remove_file(&part);
+        })
+}
+
+/// Writes a network.
+pub(crate) fn save(
+    path: &Path,
+    storage: Storage,
+    config: &NetworkConfig,
+    parameters: &Parameters,
+    card: &ModelCard,
+) -> Result<(), Error> {
+    let metadata = metadata(
+        FORMAT,
+        VERSION,
+        [("network", json(config)), ("card", json(card))],
+    );
+    write(path, storage, &parameters.entries, metadata)
+}
+
+/// Reads the head of a network's file: its configuration and its card.
+pub(crate) fn open(path: &Path) -> Result<(File, NetworkConfig, ModelCard), Error> {
+    let file = File::read(path, FORMAT, VERSION)?;
+    let config: NetworkConfig = file.json("network")?;
+    config
+        .check()
+        .map_err(|error| file.error(format!("\"network\" in its metadata: {error}")))?;
+    let card = file.json("card")?;
+    Ok((file, config, card))
+}
+
+/// Metadata of a file.
+pub(crate) fn metadata<const N: usize>(
+    format: &str,
+    version: &str,
+    texts: [(&str, String); N],
+) -> HashMap<String, String> {
+    let head = [("format", format.into()), ("version", version.into())];
+    let texts = head.into_iter().chain(texts);
+    texts.map(|(key, text)| (key.to_owned(), text)).collect()
+}
+
+/// A value as JSON.
+pub(crate) fn json(value: &impl serde::Serialize) -> String {
+    // Our own types have string keys and finite numbers only: nothing here can fail.
+    serde_json::to_string(value).unwrap_or_default()
 }

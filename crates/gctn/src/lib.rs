@@ -3,9 +3,15 @@
 //! The only crate that knows libtorch. A [`Policy`] turns two heightmaps, what is seen and what it should
 //! become, into a pick and a place pose in SE(2); a [`Trainer`] makes one from demonstrated steps.
 
+mod augment;
 mod checkpoint;
 mod config;
+mod correlation;
+mod device;
 mod error;
+mod input;
+mod losses;
+mod network;
 mod policy;
 mod sample;
 mod trainer;

@@ -1,14 +1,24 @@
 //! Decisions.
 
 use heightmap::Heightmap;
-use nalgebra::Isometry2;
+use nalgebra::{Isometry2, Point2};
 use std::path::Path;
+use tch::{Kind, Tensor};
 
-use crate::{Device, Error, ModelCard, NetworkConfig, Precision};
+use crate::augment::Warp;
+use crate::input::{check_heightmap, encode, rotation_angle, tensor, to_px, to_world};
+use crate::losses::place_logits;
+use crate::network::{Builder, Model};
+use crate::{Device, Error, ModelCard, NetworkConfig, Precision, checkpoint};
 
 /// A trained network that decides.
 #[derive(Debug)]
-pub struct Policy {}
+pub struct Policy {
+    model: Model,
+    card: ModelCard,
+    device: tch::Device,
+    exclusion_radius_m: f64,
+}
 
 /// Probabilities over a grid that covers the heightmap.
 #[derive(Clone, Debug, PartialEq)]
@@ -47,28 +57,200 @@ impl Policy {
 
     /// Loads a checkpoint. Refuses another version, missing, further or misshapen tensors, numbers that
     /// are not finite and truncated files.
-    pub fn load_for(_path: &Path, _device: Device, _precision: Precision) -> Result<Self, Error> {
-        todo!()
+    pub fn load_for(path: &Path, device: Device, precision: Precision) -> Result<Self, Error> {
+        let device = device.open()?;
+        let (file, config, card) = checkpoint::open(path)?;
+        let model = Model::new(&config, Builder::empty(device), precision);
+        file.fill(&model.parameters.entries)?;
+        Ok(Self::new(model, card, device))
+    }
+
+    pub(crate) fn new(model: Model, card: ModelCard, device: tch::Device) -> Self {
+        Self {
+            model,
+            card,
+            device,
+            exclusion_radius_m: 0.02,
+        }
+    }
+
+    /// The same policy with another radius about excluded picks (2 cm unless said).
+    pub fn with_exclusion_radius_m(self, exclusion_radius_m: f64) -> Self {
+        Self {
+            exclusion_radius_m,
+            ..self
+        }
     }
 
     /// The network's configuration.
     pub fn config(&self) -> &NetworkConfig {
-        todo!()
+        &self.model.config
     }
 
     /// What its maker wrote about it.
     pub fn card(&self) -> &ModelCard {
-        todo!()
+        &self.card
     }
 
     /// Decides where to pick and where to place, given what is seen and what it should become. Cells near
     /// an excluded pick (world) are left out. The same input and number of threads give the same bits.
     pub fn decide(
         &self,
-        _observation: &Heightmap,
-        _goal: &Heightmap,
-        _exclude: &[Isometry2<f64>],
+        observation: &Heightmap,
+        goal: &Heightmap,
+        exclude: &[Isometry2<f64>],
     ) -> Result<Decision, Error> {
-        todo!()
+        let config = &self.model.config;
+        check_heightmap(config, "observation", observation)?;
+        check_heightmap(config, "goal", goal)?;
+        let workspace = &observation.workspace;
+        let exclude_px: Vec<_> = exclude.iter().map(|pick| to_px(workspace, pick)).collect();
+        tch::no_grad(|| {
+            let encoding = self.model.encoding();
+            let mut encoded = vec![0.0; encoding.channels() * workspace.len()];
+            encode(encoding, observation, goal, &Warp::identity(), &mut encoded);
+            let input = tensor(encoding, config, &encoded).to_device(self.device);
+            let features = self.model.forward(&input);
+
+            let (pick_px, pick_score, pick_map) = self.pick(&features.pick, &exclude_px)?;
+            let turns = [(0..config.rotations).collect()];
+            let grid = &self.model.grid;
+            let logits = place_logits(grid, &features, &[pick_px], &turns, config.rotations);
+            let (place_px, rotation, place_score, place_map) =
+                self.place(&logits.squeeze_dim(0))?;
+
+            let mut yaw_rad = rotation_angle(rotation, config.rotations);
+            if yaw_rad > std::f64::consts::PI {
+                yaw_rad -= std::f64::consts::TAU;
+            }
+            Ok(Decision {
+                pick: to_world(workspace, pick_px, 0.0),
+                place: to_world(workspace, place_px, yaw_rad),
+                pick_score,
+                place_score,
+                pick_map,
+                place_map,
+            })
+        })
     }
+
+    fn map(&self, scores: Vec<f32>) -> ScoreMap {
+        let grid = &self.model.grid;
+        ScoreMap {
+            rows: grid.rows,
+            cols: grid.cols,
+            scores,
+        }
+    }
+
+    fn pick(
+        &self,
+        logits: &Tensor,
+        exclude_px: &[Point2<f64>],
+    ) -> Result<(Point2<f64>, f64, ScoreMap), Error> {
+        let grid = &self.model.grid;
+        let mut logits = values(logits, "the pick map")?;
+        let center_px = |index: usize| {
+            let (row, col) = (index / grid.cols, index % grid.cols);
+            Point2::new(
+                grid.coordinate_px(col as f64),
+                grid.coordinate_px(row as f64),
+            )
+        };
+        let radius_px = self.exclusion_radius_m / self.model.config.pixel_size_m;
+        for (index, logit) in logits.iter_mut().enumerate() {
+            let center_px = center_px(index);
+            if exclude_px
+                .iter()
+                .any(|pick| (pick - center_px).norm() <= radius_px)
+            {
+                *logit = f32::NEG_INFINITY;
+            }
+        }
+        let best = argmax(&logits);
+        let top = logits[best];
+        if top == f32::NEG_INFINITY {
+            return Err(Error::NothingToPick {
+                count: exclude_px.len(),
+                radius_m: self.exclusion_radius_m,
+            });
+        }
+        let sum: f64 = logits
+            .iter()
+            .map(|logit| f64::from(logit - top).exp())
+            .sum();
+        let scores = logits
+            .iter()
+            .map(|logit| (f64::from(logit - top).exp() / sum) as f32)
+            .collect();
+        Ok((center_px(best), sum.recip(), self.map(scores)))
+    }
+
+    fn place(&self, logits: &Tensor) -> Result<(Point2<f64>, usize, f64, ScoreMap), Error> {
+        let grid = &self.model.grid;
+        let log_sum = logits
+            .flatten(0, -1)
+            .logsumexp([0].as_slice(), false)
+            .double_value(&[]);
+        let logits = values(logits, "the place map")?;
+        let best = argmax(&logits);
+        let cells = grid.rows * grid.cols;
+        let (rotation, cell) = (best / cells, best % cells);
+        let map = &logits[rotation * cells..(rotation + 1) * cells];
+        let (row, col) = (cell / grid.cols, cell % grid.cols);
+        let offset = if grid.subcell {
+            subcell(map, grid.rows, grid.cols, row, col)
+        } else {
+            [0.0; 2]
+        };
+        let place_px = Point2::new(
+            grid.coordinate_px(col as f64 + offset[0]),
+            grid.coordinate_px(row as f64 + offset[1]),
+        );
+        let score = |logit: f32| (f64::from(logit) - log_sum).exp();
+        let scores = map.iter().map(|logit| score(*logit) as f32).collect();
+        Ok((place_px, rotation, score(logits[best]), self.map(scores)))
+    }
+}
+
+/// The numbers of a tensor, all finite.
+fn values(tensor: &Tensor, what: &'static str) -> Result<Vec<f32>, Error> {
+    let tensor = tensor
+        .to_device(tch::Device::Cpu)
+        .to_kind(Kind::Float)
+        .contiguous();
+    let mut values = vec![0.0; tensor.numel()];
+    tensor.f_copy_data(&mut values, tensor.numel())?;
+    if values.iter().all(|value: &f32| value.is_finite()) {
+        Ok(values)
+    } else {
+        Err(Error::NotFinite { what, step: None })
+    }
+}
+
+/// Index of the first of the largest.
+fn argmax(values: &[f32]) -> usize {
+    let top = values.iter().copied().fold(f32::NEG_INFINITY, f32::max);
+    values.iter().position(|value| *value == top).unwrap_or(0)
+}
+
+/// Where between cells the maximum lies, as offset along columns and rows: labels are Gaussians, so
+/// logarithms of probabilities are parabolas.
+fn subcell(map: &[f32], rows: usize, cols: usize, row: usize, col: usize) -> [f64; 2] {
+    let offset = |index: usize, len: usize, at: &dyn Fn(usize) -> f32| {
+        if index == 0 || index + 1 == len {
+            return 0.0;
+        }
+        let [before, here, after] = [at(index - 1), at(index), at(index + 1)].map(f64::from);
+        let curvature = before - 2.0 * here + after;
+        if curvature < 0.0 {
+            (0.5 * (before - after) / curvature).clamp(-0.5, 0.5)
+        } else {
+            0.0
+        }
+    };
+    [
+        offset(col, cols, &|col| map[row * cols + col]),
+        offset(row, rows, &|row| map[row * cols + col]),
+    ]
 }

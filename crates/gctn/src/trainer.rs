@@ -1,12 +1,27 @@
 //! Training.
 
+use rand_chacha::{ChaCha8Rng, rand_core::SeedableRng};
 use std::path::Path;
+use tch::Tensor;
 
-use crate::{Error, ModelCard, NetworkConfig, Policy, Sample, Storage, TrainingConfig};
+use crate::augment::Warp;
+use crate::checkpoint::{self, File};
+use crate::input::{Label, encode, tensor};
+use crate::losses::{pick_loss, place_loss};
+use crate::network::{Builder, Model};
+use crate::{Error, ModelCard, NetworkConfig, Policy, Sample, Schedule, Storage, TrainingConfig};
 
-/// A network in training, its optimiser and its random state.
+/// A network in training, its optimiser (AdamW) and its random state.
 #[derive(Debug)]
-pub struct Trainer {}
+pub struct Trainer {
+    config: TrainingConfig,
+    device: tch::Device,
+    model: Model,
+    weights: Vec<Tensor>,
+    /// Running mean of the gradient, and of its square, over the flat weights.
+    moments: [Tensor; 2],
+    step: u64,
+}
 
 /// Mean losses of a batch, in nats.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -19,56 +34,273 @@ pub struct Losses {
     pub gradient_norm: f64,
 }
 
+const BETAS: [f64; 2] = [0.9, 0.999];
+const EPSILON: f64 = 1e-8;
+const FORMAT: &str = "gctn-training";
+const VERSION: &str = "1";
+
 impl Trainer {
-    /// A network with random weights.
-    pub fn new(_network: &NetworkConfig, _training: &TrainingConfig) -> Result<Self, Error> {
-        todo!()
+    /// A network with random weights. Sets the threads of libtorch, in the whole process.
+    pub fn new(network: &NetworkConfig, training: &TrainingConfig) -> Result<Self, Error> {
+        network.check()?;
+        training.check()?;
+        crate::set_threads(training.threads);
+        let device = training.device.open()?;
+        let model = Model::new(
+            network,
+            Builder::random(training.seed, device),
+            training.precision,
+        );
+        let weights = model.parameters.require_gradients();
+        let moments = [(); 2].map(|()| model.parameters.flat.zeros_like());
+        Ok(Self {
+            config: training.clone(),
+            device,
+            model,
+            weights,
+            moments,
+            step: 0,
+        })
     }
 
-    /// One gradient step on a batch of the configured size. Fails, leaving the weights as they were, when
-    /// loss or gradient is not finite.
-    pub fn train_step(&mut self, _samples: &[Sample<'_>]) -> Result<Losses, Error> {
-        todo!()
+    /// The network's configuration.
+    pub fn network(&self) -> &NetworkConfig {
+        &self.model.config
     }
 
-    /// Losses without augmentation and without learning: for validation. Any number of samples.
-    pub fn losses(&self, _samples: &[Sample<'_>]) -> Result<Losses, Error> {
-        todo!()
+    /// How it is trained.
+    pub fn config(&self) -> &TrainingConfig {
+        &self.config
     }
 
     /// Gradient steps done.
     pub fn step(&self) -> u64 {
-        todo!()
+        self.step
+    }
+
+    /// How many weights the network has.
+    pub fn parameters(&self) -> usize {
+        self.model.parameters.len()
+    }
+
+    /// Learning rate of the next step.
+    pub fn learning_rate(&self) -> f64 {
+        let TrainingConfig {
+            learning_rate,
+            schedule,
+            warm_up_steps,
+            steps,
+            ..
+        } = self.config;
+        let warm_up = ((self.step + 1) as f64 / (warm_up_steps + 1) as f64).min(1.0);
+        let factor = match schedule {
+            Schedule::Constant => 1.0,
+            Schedule::Cosine => {
+                let after = self.step.saturating_sub(warm_up_steps) as f64;
+                let span = steps.saturating_sub(warm_up_steps).max(1) as f64;
+                0.5 + 0.5 * (std::f64::consts::PI * (after / span).min(1.0)).cos()
+            }
+        };
+        learning_rate * warm_up * factor
+    }
+
+    /// One gradient step on a batch of the configured size. Fails, leaving the weights as they were, when
+    /// loss or gradient is not finite.
+    pub fn train_step(&mut self, samples: &[Sample<'_>]) -> Result<Losses, Error> {
+        if samples.len() != self.config.batch {
+            return Err(Error::Batch {
+                actual: samples.len(),
+                expected: self.config.batch,
+            });
+        }
+        // A stream of its own for each step: the random state is the step's number.
+        let mut rng = ChaCha8Rng::seed_from_u64(self.config.seed);
+        rng.set_stream(self.step + 1);
+        let [pick, place] = self.forward(samples, &mut rng, true)?;
+        let gradients = Tensor::f_run_backward(&[&pick + &place], &self.weights, false, false)?;
+        let flat: Vec<Tensor> = gradients
+            .iter()
+            .map(|gradient| gradient.reshape([-1]))
+            .collect();
+        let gradient = Tensor::cat(&flat, 0);
+        let losses = Losses {
+            pick: pick.double_value(&[]),
+            place: place.double_value(&[]),
+            gradient_norm: gradient.norm().double_value(&[]),
+        };
+        for (what, value) in [
+            ("the pick loss", losses.pick),
+            ("the place loss", losses.place),
+            ("the gradient", losses.gradient_norm),
+        ] {
+            if !value.is_finite() {
+                let step = Some(self.step);
+                return Err(Error::NotFinite { what, step });
+            }
+        }
+        self.update(gradient, losses.gradient_norm);
+        self.step += 1;
+        Ok(losses)
+    }
+
+    /// Losses without augmentation and without learning: for validation. Any number of samples but none.
+    pub fn losses(&self, samples: &[Sample<'_>]) -> Result<Losses, Error> {
+        if samples.is_empty() {
+            return Err(Error::Batch {
+                actual: 0,
+                expected: self.config.batch,
+            });
+        }
+        let mut rng = ChaCha8Rng::seed_from_u64(self.config.seed);
+        let [pick, place] = tch::no_grad(|| self.forward(samples, &mut rng, false))?;
+        Ok(Losses {
+            pick: pick.double_value(&[]),
+            place: place.double_value(&[]),
+            gradient_norm: 0.0,
+        })
+    }
+
+    fn forward(
+        &self,
+        samples: &[Sample<'_>],
+        rng: &mut ChaCha8Rng,
+        augment: bool,
+    ) -> Result<[Tensor; 2], Error> {
+        let network = &self.model.config;
+        let encoding = self.model.encoding();
+        let cells = network.rows * network.cols;
+        let mut encoded = vec![0.0; samples.len() * encoding.channels() * cells];
+        let mut labels = Vec::new();
+        let images = encoded.chunks_exact_mut(encoding.channels() * cells);
+        for ((index, sample), image) in samples.iter().enumerate().zip(images) {
+            let label = Label::of(network, index, sample)?;
+            let warp = if augment {
+                let labels_px = [label.pick_px, label.place_px];
+                Warp::draw(
+                    &self.config.augmentation,
+                    network.rows,
+                    network.cols,
+                    labels_px,
+                    rng,
+                )
+            } else {
+                Warp::identity()
+            };
+            encode(encoding, sample.observation, sample.goal, &warp, image);
+            labels.push(label.warped(&warp));
+        }
+        let input = tensor(encoding, network, &encoded).to_device(self.device);
+        let features = self.model.forward(&input);
+        let (grid, sigma) = (&self.model.grid, self.config.label_sigma_cells);
+        let pick = pick_loss(grid, sigma, &features, &labels);
+        let loss = self.config.place_loss;
+        let place = place_loss(
+            grid,
+            loss,
+            sigma,
+            network.rotations,
+            &features,
+            &labels,
+            rng,
+        );
+        Ok([pick, place])
+    }
+
+    /// AdamW (Loshchilov and Hutter, 2019) on the flat weights.
+    fn update(&mut self, mut gradient: Tensor, norm: f64) {
+        let rate = self.learning_rate();
+        let count = self.step as i32 + 1;
+        tch::no_grad(|| {
+            if let Some(clip) = self.config.gradient_clip.filter(|clip| norm > *clip) {
+                gradient *= clip / norm;
+            }
+            let [mean, square] = &mut self.moments;
+            *mean *= BETAS[0];
+            *mean += &gradient * (1.0 - BETAS[0]);
+            *square *= BETAS[1];
+            *square += gradient.square_() * (1.0 - BETAS[1]);
+            let [mean_bias, square_bias] = BETAS.map(|beta| 1.0 - beta.powi(count));
+            let divisor = (&*square / square_bias).sqrt_() + EPSILON;
+            let weights = &mut self.model.parameters.flat;
+            *weights *= 1.0 - rate * self.config.weight_decay;
+            *weights -= (&*mean / divisor) * (rate / mean_bias);
+        });
     }
 
     /// A policy with a copy of the present weights.
     pub fn policy(&self) -> Result<Policy, Error> {
-        todo!()
+        let builder = Builder::empty(self.device);
+        let model = Model::new(&self.model.config, builder, self.config.precision);
+        tch::no_grad(|| {
+            let mut flat = model.parameters.flat.shallow_clone();
+            flat.f_copy_(&self.model.parameters.flat)
+        })?;
+        Ok(Policy::new(model, ModelCard::new(), self.device))
     }
 
     /// Writes the network for [`Policy::load`]. The file appears whole or not at all.
     pub fn save_checkpoint(
         &self,
-        _path: &Path,
-        _storage: Storage,
-        _card: &ModelCard,
+        path: &Path,
+        storage: Storage,
+        card: &ModelCard,
     ) -> Result<(), Error> {
-        todo!()
+        let Model {
+            config, parameters, ..
+        } = &self.model;
+        checkpoint::save(path, storage, config, parameters, card)
+    }
+
+    /// The flat tensors of a saved state, by name.
+    fn state(&self) -> Vec<(String, Tensor)> {
+        let [mean, square] = &self.moments;
+        let flats = [
+            ("weights", &self.model.parameters.flat),
+            ("mean", mean),
+            ("square", square),
+        ];
+        flats
+            .map(|(name, tensor)| (name.to_owned(), tensor.shallow_clone()))
+            .into()
     }
 
     /// Writes all that is needed to go on: weights, optimiser, random state. The file appears whole or
     /// not at all.
-    pub fn save_state(&self, _path: &Path) -> Result<(), Error> {
-        todo!()
+    pub fn save_state(&self, path: &Path) -> Result<(), Error> {
+        let texts = [
+            ("network", checkpoint::json(&self.model.config)),
+            ("training", checkpoint::json(&self.config)),
+            ("step", self.step.to_string()),
+        ];
+        let metadata = checkpoint::metadata(FORMAT, VERSION, texts);
+        checkpoint::write(path, Storage::F32, &self.state(), metadata)
     }
 
     /// Goes on where [`Trainer::save_state`] stopped, bit for bit on the processor with the same number of
-    /// threads. Refuses a state of another configuration.
+    /// threads. Refuses a state of another configuration; threads and device may differ.
     pub fn resume(
-        _path: &Path,
-        _network: &NetworkConfig,
-        _training: &TrainingConfig,
+        path: &Path,
+        network: &NetworkConfig,
+        training: &TrainingConfig,
     ) -> Result<Self, Error> {
-        todo!()
+        let file = File::read(path, FORMAT, VERSION)?;
+        let saved: NetworkConfig = file.json("network")?;
+        if saved != *network {
+            let (saved, asked) = (checkpoint::json(&saved), checkpoint::json(network));
+            return Err(file.error(format!("it is of the network {saved}, expected {asked}")));
+        }
+        let saved = TrainingConfig {
+            threads: training.threads,
+            device: training.device,
+            ..file.json("training")?
+        };
+        if saved != *training {
+            let (saved, asked) = (checkpoint::json(&saved), checkpoint::json(training));
+            return Err(file.error(format!("it is of the training {saved}, expected {asked}")));
+        }
+        let mut trainer = Self::new(network, training)?;
+        trainer.step = file.json("step")?;
+        file.fill(&trainer.state())?;
+        Ok(trainer)
     }
 }

@@ -1,0 +1,445 @@
+//! From heightmaps to the tensors that networks read.
+
+use heightmap::{Heightmap, HeightmapError, Workspace};
+use nalgebra::{Isometry2, Point2, Vector3};
+use tch::Tensor;
+
+use crate::augment::Warp;
+use crate::{Error, Interpolation, NetworkConfig, Sample};
+
+/// Colour (0..255) and height (m) of a cell.
+type Cell = [f32; 4];
+
+/// What a network reads of each cell.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Encoding {
+    /// RGB in 0..255 and height in metres of the observation, then of the goal.
+    Raw,
+    /// RGB and height of observation and goal, scaled; their differences; mean absolute colour difference;
+    /// absolute height difference.
+    Difference,
+}
+
+impl Encoding {
+    /// Number of channels.
+    pub const fn channels(self) -> usize {
+        match self {
+            Self::Raw => 8,
+            Self::Difference => 14,
+        }
+    }
+
+    #[inline(always)]
+    fn write(self, observation: Cell, goal: Cell, out: &mut [f32]) {
+        match self {
+            Self::Raw => {
+                out[..4].copy_from_slice(&observation);
+                out[4..8].copy_from_slice(&goal);
+            }
+            Self::Difference => {
+                // Heights of 40 mm, the edge of a block, count as much as half the range of a colour.
+                let scaled = |cell: Cell| -> Cell {
+                    std::array::from_fn(|i| match i {
+                        3 => cell[3] * (1.0 / 0.04),
+                        _ => cell[i] * (1.0 / 128.0) - 1.1,
+                    })
+                };
+                let (observation, goal) = (scaled(observation), scaled(goal));
+                let difference: Cell = std::array::from_fn(|i| goal[i] - observation[i]);
+                out[..4].copy_from_slice(&observation);
+                out[4..8].copy_from_slice(&goal);
+                out[8..12].copy_from_slice(&difference);
+                let colour = difference[0].abs() + difference[1].abs() + difference[2].abs();
+                out[12] = colour * (1.0 / 3.0);
+                out[13] = difference[3].abs();
+            }
+        }
+    }
+}
+
+/// A heightmap as rows of cells, zero outside.
+struct Image<'a> {
+    rows: usize,
+    cols: usize,
+    rgb: &'a [u8],
+    height_m: &'a [f32],
+}
+
+impl<'a> Image<'a> {
+    fn new(heightmap: &'a Heightmap) -> Self {
+        Self {
+            rows: heightmap.workspace.rows,
+            cols: heightmap.workspace.cols,
+            rgb: &heightmap.rgb,
+            height_m: &heightmap.height_m,
+        }
+    }
+
+    #[inline(always)]
+    fn cell(&self, row: i32, col: i32) -> Cell {
+        // Negative indices wrap to huge ones.
+        if row as u32 >= self.rows as u32 || col as u32 >= self.cols as u32 {
+            return [0.0; 4];
+        }
+        let index = row as usize * self.cols + col as usize;
+        let rgb = &self.rgb[3 * index..3 * index + 3];
+        [
+            rgb[0] as f32,
+            rgb[1] as f32,
+            rgb[2] as f32,
+            self.height_m[index],
+        ]
+    }
+
+    #[inline(always)]
+    fn sample(&self, x: f32, y: f32, interpolation: Interpolation) -> Cell {
+        match interpolation {
+            Interpolation::Nearest => self.cell(y.floor() as i32, x.floor() as i32),
+            Interpolation::Bilinear => {
+                let (x, y) = (x - 0.5, y - 0.5);
+                let (left, top) = (x.floor(), y.floor());
+                let (right_share, bottom_share) = (x - left, y - top);
+                let (row, col) = (top as i32, left as i32);
+                let corners =
+                    [(0, 0), (0, 1), (1, 0), (1, 1)].map(|(i, j)| self.cell(row + i, col + j));
+                std::array::from_fn(|i| {
+                    let top = corners[0][i] + right_share * (corners[1][i] - corners[0][i]);
+                    let bottom = corners[2][i] + right_share * (corners[3][i] - corners[2][i]);
+                    top + bottom_share * (bottom - top)
+                })
+            }
+        }
+    }
+}
+
+/// Writes what a network reads, cell after cell, rows first, into `out`.
+pub(crate) fn encode(
+    encoding: Encoding,
+    observation: &Heightmap,
+    goal: &Heightmap,
+    warp: &Warp,
+    out: &mut [f32],
+) {
+    match (encoding, warp.interpolation) {
+        // Constants, so that the inner loop has no branches.
+        (Encoding::Raw, Interpolation::Nearest) => {
+            encode_as(
+                Encoding::Raw,
+                Interpolation::Nearest,
+                observation,
+                goal,
+                warp,
+                out,
+            );
+        }
+        (Encoding::Raw, Interpolation::Bilinear) => {
+            encode_as(
+                Encoding::Raw,
+                Interpolation::Bilinear,
+                observation,
+                goal,
+                warp,
+                out,
+            );
+        }
+        (Encoding::Difference, Interpolation::Nearest) => {
+            encode_as(
+                Encoding::Difference,
+                Interpolation::Nearest,
+                observation,
+                goal,
+                warp,
+                out,
+            );
+        }
+        (Encoding::Difference, Interpolation::Bilinear) => {
+            encode_as(
+                Encoding::Difference,
+                Interpolation::Bilinear,
+                observation,
+                goal,
+                warp,
+                out,
+            );
+        }
+    }
+}
+
+#[inline(always)]
+fn encode_as(
+    encoding: Encoding,
+    interpolation: Interpolation,
+    observation: &Heightmap,
+    goal: &Heightmap,
+    warp: &Warp,
+    out: &mut [f32],
+) {
+    let [observation, goal] = [observation, goal].map(Image::new);
+    let inverse = warp.motion_px.inverse();
+    let (cos, sin) = (inverse.rotation.re, inverse.rotation.im);
+    let offset = inverse.translation.vector;
+    let colour = |cell: Cell| match &warp.colour {
+        None => cell,
+        Some(matrix) => {
+            let rgb = matrix * Vector3::new(cell[0], cell[1], cell[2]);
+            let rgb = rgb.map(|channel| channel.clamp(0.0, 255.0));
+            [rgb.x, rgb.y, rgb.z, cell[3]]
+        }
+    };
+    let cells = out.chunks_exact_mut(encoding.channels());
+    for (index, out) in cells.enumerate() {
+        let (row, col) = (index / observation.cols, index % observation.cols);
+        let (x, y) = (col as f64 + 0.5, row as f64 + 0.5);
+        let x_source = (cos * x - sin * y + offset.x) as f32;
+        let y_source = (sin * x + cos * y + offset.y) as f32;
+        let seen = colour(observation.sample(x_source, y_source, interpolation));
+        let wanted = colour(goal.sample(x_source, y_source, interpolation));
+        encoding.write(seen, wanted, out);
+    }
+}
+
+/// Makes a tensor N x channels x rows x cols, channels last in memory, of encoded images.
+pub(crate) fn tensor(encoding: Encoding, config: &NetworkConfig, encoded: &[f32]) -> Tensor {
+    let (rows, cols) = (config.rows as i64, config.cols as i64);
+    Tensor::from_slice(encoded)
+        .view([-1, rows, cols, encoding.channels() as i64])
+        .permute([0, 3, 1, 2])
+}
+
+/// Refuses a heightmap that does not fit the network or itself.
+pub(crate) fn check_heightmap(
+    config: &NetworkConfig,
+    what: &'static str,
+    heightmap: &Heightmap,
+) -> Result<(), Error> {
+    config.check_workspace(&heightmap.workspace)?;
+    let cells = heightmap.workspace.len();
+    for (buffer, actual, expected) in [
+        ("rgb", heightmap.rgb.len(), 3 * cells),
+        ("height_m", heightmap.height_m.len(), cells),
+    ] {
+        if actual != expected {
+            let source = HeightmapError::Size {
+                what: buffer,
+                actual,
+                expected,
+            };
+            return Err(Error::Heightmap { what, source });
+        }
+    }
+    match heightmap
+        .height_m
+        .iter()
+        .position(|height| !height.is_finite())
+    {
+        Some(index) => {
+            let source = HeightmapError::NotFinite { index };
+            Err(Error::Heightmap { what, source })
+        }
+        None => Ok(()),
+    }
+}
+
+/// Continuous image coordinates of a world position.
+pub(crate) fn to_px(workspace: &Workspace, pose: &Isometry2<f64>) -> Point2<f64> {
+    let from_corner = pose.translation.vector - workspace.origin_m.coords;
+    Point2::from(from_corner / workspace.pixel_size_m)
+}
+
+/// World pose at continuous image coordinates.
+pub(crate) fn to_world(
+    workspace: &Workspace,
+    point_px: Point2<f64>,
+    yaw_rad: f64,
+) -> Isometry2<f64> {
+    let position_m = workspace.origin_m.coords + point_px.coords * workspace.pixel_size_m;
+    Isometry2::new(position_m, yaw_rad)
+}
+
+/// What a sample teaches, in image coordinates.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) struct Label {
+    /// Where to pick.
+    pub pick_px: Point2<f64>,
+    /// Where to place.
+    pub place_px: Point2<f64>,
+    /// Index of the rotation nearest to the object's turn.
+    pub rotation: usize,
+}
+
+impl Label {
+    /// Checks the sample, and reads its label.
+    pub fn of(config: &NetworkConfig, index: usize, sample: &Sample<'_>) -> Result<Self, Error> {
+        check_heightmap(config, "observation", sample.observation)?;
+        check_heightmap(config, "goal", sample.goal)?;
+        let workspace = &sample.observation.workspace;
+        for (what, pose) in [("pick", &sample.pick), ("place", &sample.place)] {
+            let position = to_px(workspace, pose);
+            let inside = (0.0..config.cols as f64).contains(&position.x)
+                && (0.0..config.rows as f64).contains(&position.y);
+            if !inside || !pose.rotation.angle().is_finite() {
+                return Err(Error::Label {
+                    index,
+                    what,
+                    x_m: pose.translation.x,
+                    y_m: pose.translation.y,
+                    yaw_rad: pose.rotation.angle(),
+                });
+            }
+        }
+        let turn = sample.pick.rotation.angle_to(&sample.place.rotation);
+        Ok(Self {
+            pick_px: to_px(workspace, &sample.pick),
+            place_px: to_px(workspace, &sample.place),
+            rotation: rotation_index(turn, config.rotations),
+        })
+    }
+
+    /// The label after a warp. The object's turn stays: both poses turn alike.
+    pub fn warped(self, warp: &Warp) -> Self {
+        Self {
+            pick_px: warp.motion_px * self.pick_px,
+            place_px: warp.motion_px * self.place_px,
+            ..self
+        }
+    }
+}
+
+/// Index of the rotation nearest to an angle.
+pub(crate) fn rotation_index(angle_rad: f64, rotations: usize) -> usize {
+    let share = (angle_rad / std::f64::consts::TAU).rem_euclid(1.0);
+    (share * rotations as f64).round() as usize % rotations
+}
+
+/// Angle of a rotation, in [0, 2 pi).
+pub(crate) fn rotation_angle(index: usize, rotations: usize) -> f64 {
+    std::f64::consts::TAU * index as f64 / rotations as f64
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use nalgebra::Vector2;
+    use proptest::prelude::*;
+
+    fn numbered() -> Heightmap {
+        let mut heightmap = Heightmap::new(Workspace::RAVENS);
+        for (index, height) in heightmap.height_m.iter_mut().enumerate() {
+            *height = index as f32;
+        }
+        heightmap
+    }
+
+    fn heights(warp: &Warp) -> Vec<f32> {
+        let heightmap = numbered();
+        let mut out = vec![0.0; 8 * heightmap.workspace.len()];
+        encode(Encoding::Raw, &heightmap, &heightmap, warp, &mut out);
+        out.iter().skip(3).step_by(8).copied().collect()
+    }
+
+    #[test]
+    fn no_warp_changes_nothing() {
+        for interpolation in [Interpolation::Nearest, Interpolation::Bilinear] {
+            let warp = Warp {
+                interpolation,
+                ..Warp::identity()
+            };
+            assert_eq!(heights(&warp), numbered().height_m);
+        }
+    }
+
+    #[test]
+    fn a_quarter_turn_takes_columns_to_rows() {
+        // (x, y) -> (-y, x) about (80, 160): a point 10 to the right of the middle goes 10 below it.
+        let middle = Vector2::new(80.0, 160.0);
+        let motion_px = Isometry2::new(middle, 0.0)
+            * Isometry2::rotation(std::f64::consts::FRAC_PI_2)
+            * Isometry2::new(-middle, 0.0);
+        let warp = Warp {
+            motion_px,
+            ..Warp::identity()
+        };
+        let heights = heights(&warp);
+        let source = 160 * 160 + 90;
+        // Cell centre (90.5, 160.5) goes to (79.5, 170.5).
+        assert_eq!(heights[170 * 160 + 79], source as f32);
+    }
+
+    #[test]
+    fn what_comes_from_outside_is_zero() {
+        let warp = Warp {
+            motion_px: Isometry2::translation(0.0, 5.0),
+            ..Warp::identity()
+        };
+        let heights = heights(&warp);
+        assert!(heights[..5 * 160].iter().all(|height| *height == 0.0));
+        assert_eq!(heights[5 * 160 + 7], 7.0);
+    }
+
+    #[test]
+    fn bilinear_samples_lie_between_cells() {
+        let warp = Warp {
+            motion_px: Isometry2::translation(0.25, 0.0),
+            interpolation: Interpolation::Bilinear,
+            ..Warp::identity()
+        };
+        assert_eq!(heights(&warp)[160 * 10 + 20], 160.0 * 10.0 + 20.0 - 0.25);
+    }
+
+    proptest! {
+        #[test]
+        fn a_warped_label_lies_on_the_warped_object(
+            row in 60usize..260, col in 30usize..130, x in -20.0..20.0, y in -40.0..40.0, turn in -3.0..3.0f64,
+        ) {
+            let mut heightmap = Heightmap::new(Workspace::RAVENS);
+            // 3 x 3 cells, so that nearest sampling cannot miss it.
+            for row in row - 1..=row + 1 {
+                for col in col - 1..=col + 1 {
+                    heightmap.height_m[row * 160 + col] = 1.0;
+                }
+            }
+            let middle = Vector2::new(80.0, 160.0);
+            let motion_px = Isometry2::new(middle + Vector2::new(x, y), 0.0)
+                * Isometry2::rotation(turn) * Isometry2::new(-middle, 0.0);
+            let warp = Warp { motion_px, ..Warp::identity() };
+            let label = motion_px * Point2::new(col as f64 + 0.5, row as f64 + 0.5);
+            prop_assume!((1.0..159.0).contains(&label.x) && (1.0..319.0).contains(&label.y));
+            let mut out = vec![0.0; 8 * heightmap.workspace.len()];
+            encode(Encoding::Raw, &heightmap, &heightmap, &warp, &mut out);
+            let index = label.y.floor() as usize * 160 + label.x.floor() as usize;
+            prop_assert_eq!(out[8 * index + 3], 1.0);
+        }
+
+        #[test]
+        fn image_coordinates_come_back(x in 0.3..0.7, y in -0.4..0.4, yaw in -3.0..3.0f64) {
+            let pose = Isometry2::new(Vector2::new(x, y), yaw);
+            let point = to_px(&Workspace::RAVENS, &pose);
+            let back = to_world(&Workspace::RAVENS, point, yaw);
+            prop_assert!((back.translation.vector - pose.translation.vector).norm() < 1e-12);
+            let pixel = Workspace::RAVENS.pixel(&Point2::new(x, y)).unwrap();
+            prop_assert_eq!((pixel.col, pixel.row), (point.x as usize, point.y as usize));
+        }
+
+        #[test]
+        fn rotations_round_to_the_nearest(index in 0usize..36, off in -0.08..0.08f64, turns in -2i32..3) {
+            let angle = rotation_angle(index, 36) + off + f64::from(turns) * std::f64::consts::TAU;
+            prop_assert_eq!(rotation_index(angle, 36), index);
+        }
+    }
+
+    #[test]
+    fn a_label_off_the_table_is_named() {
+        let heightmap = numbered();
+        let sample = Sample {
+            observation: &heightmap,
+            goal: &heightmap,
+            pick: Isometry2::new(Vector2::new(0.5, 0.0), 0.0),
+            place: Isometry2::new(Vector2::new(0.5, f64::NAN), 0.0),
+        };
+        let error = Label::of(&NetworkConfig::compact(), 3, &sample).unwrap_err();
+        assert!(
+            error.to_string().starts_with("sample 3: the place pose"),
+            "{error}"
+        );
+    }
+}

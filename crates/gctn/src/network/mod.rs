@@ -1,0 +1,140 @@
+//! The networks, and what they share.
+
+mod compact;
+mod parameters;
+mod resnet43;
+
+use tch::{Kind, Tensor};
+
+use crate::input::Encoding;
+use crate::{Interpolation, Network, NetworkConfig, Precision};
+use compact::CompactNet;
+use resnet43::Resnet43Nets;
+
+pub(crate) use parameters::{Builder, Parameters};
+
+/// What a network says about a batch.
+pub(crate) struct Features {
+    /// Pick logits, N x rows x cols of the grid.
+    pub pick: Tensor,
+    /// Query features, N x C x rows x cols, with `query_margin` cells around.
+    pub query: Tensor,
+    /// Key features, N x C x rows x cols, with `margin` cells around.
+    pub key: Tensor,
+    /// Factor from correlation to logit.
+    pub scale: Tensor,
+}
+
+/// The grid of a network's output, and its query window.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) struct Grid {
+    /// Cells along +y.
+    pub rows: usize,
+    /// Cells along +x.
+    pub cols: usize,
+    /// Heightmap cells per cell.
+    pub stride: usize,
+    /// Edge length of the query window, in cells.
+    pub window: usize,
+    /// Cells of the window before the pick; also the cells around the key features.
+    pub margin: usize,
+    /// Cells around the query features.
+    pub query_margin: usize,
+    /// How the query window is sampled.
+    pub sampling: Interpolation,
+    /// Whether the place is looked for between cells.
+    pub subcell: bool,
+}
+
+impl Grid {
+    /// Continuous index (0 at the centre of the first cell) of a continuous image coordinate.
+    pub fn index(&self, coordinate_px: f64) -> f64 {
+        coordinate_px / self.stride as f64 - 0.5
+    }
+
+    /// Continuous image coordinate of a continuous index.
+    pub fn coordinate_px(&self, index: f64) -> f64 {
+        (index + 0.5) * self.stride as f64
+    }
+}
+
+#[derive(Debug)]
+enum Nets {
+    Compact(CompactNet),
+    Resnet43(Resnet43Nets),
+}
+
+/// A network with its weights.
+#[derive(Debug)]
+pub(crate) struct Model {
+    pub config: NetworkConfig,
+    pub parameters: Parameters,
+    pub grid: Grid,
+    precision: Precision,
+    nets: Nets,
+}
+
+impl Model {
+    /// A network with weights from `builder`. The configuration must have been checked.
+    pub fn new(config: &NetworkConfig, mut builder: Builder, precision: Precision) -> Self {
+        let (nets, grid) = match &config.network {
+            Network::Compact(compact) => {
+                let grid = Grid {
+                    rows: config.rows / 2,
+                    cols: config.cols / 2,
+                    stride: 2,
+                    window: compact.window_cells,
+                    margin: compact.window_cells / 2,
+                    query_margin: 0,
+                    sampling: Interpolation::Bilinear,
+                    subcell: true,
+                };
+                (Nets::Compact(CompactNet::new(compact, &mut builder)), grid)
+            }
+            Network::Resnet43(resnet43) => {
+                let grid = Grid {
+                    rows: config.rows,
+                    cols: config.cols,
+                    stride: 1,
+                    window: resnet43.crop_px,
+                    margin: resnet43.crop_px / 2,
+                    query_margin: resnet43.crop_px / 2,
+                    sampling: resnet43.rotation_sampling,
+                    subcell: false,
+                };
+                (
+                    Nets::Resnet43(Resnet43Nets::new(resnet43, &mut builder)),
+                    grid,
+                )
+            }
+        };
+        Self {
+            config: config.clone(),
+            parameters: builder.finish(),
+            grid,
+            precision,
+            nets,
+        }
+    }
+
+    /// What the network reads.
+    pub fn encoding(&self) -> Encoding {
+        match &self.nets {
+            Nets::Compact(_) => Encoding::Difference,
+            Nets::Resnet43(_) => Encoding::Raw,
+        }
+    }
+
+    /// Runs the convolutions. `input` is what [`crate::input::tensor`] makes, on the weights' device.
+    pub fn forward(&self, input: &Tensor) -> Features {
+        let input = input.to_kind(self.parameters.flat.kind());
+        let kind = match self.precision {
+            Precision::F32 => input.kind(),
+            Precision::Bf16 => Kind::BFloat16,
+        };
+        match &self.nets {
+            Nets::Compact(net) => net.forward(&input, kind),
+            Nets::Resnet43(nets) => nets.forward(&input, kind),
+        }
+    }
+}

@@ -1,0 +1,172 @@
+//! Weights in one flat tensor, and convolutions that use them.
+
+use rand::RngExt;
+use rand_chacha::{ChaCha8Rng, rand_core::SeedableRng};
+use tch::{Device, Kind, Tensor};
+
+/// How weights start.
+#[derive(Clone, Copy, Debug)]
+pub(crate) enum Init {
+    /// Uniform in +-1 / sqrt(fan in), weights and biases.
+    FanIn,
+    /// Uniform in +-sqrt(6 / (fan in + fan out)); biases 0 (Glorot and Bengio, 2010).
+    Glorot,
+    /// All 0.
+    Zero,
+}
+
+/// Makes weights, in the order in which they are asked for.
+pub(crate) struct Builder {
+    rng: Option<ChaCha8Rng>,
+    device: Device,
+    kind: Kind,
+    entries: Vec<(String, Tensor)>,
+}
+
+impl Builder {
+    /// Random weights.
+    pub fn random(seed: u64, device: Device) -> Self {
+        Self {
+            rng: Some(ChaCha8Rng::seed_from_u64(seed)),
+            device,
+            kind: Kind::Float,
+            entries: Vec::new(),
+        }
+    }
+
+    /// Weights that are 0 and to be filled.
+    pub fn empty(device: Device) -> Self {
+        Self {
+            rng: None,
+            ..Self::random(0, device)
+        }
+    }
+
+    /// The same in 64-bit floats.
+    #[cfg(test)]
+    pub fn double(self) -> Self {
+        Self {
+            kind: Kind::Double,
+            ..self
+        }
+    }
+
+    fn add(&mut self, name: String, tensor: Tensor) -> Tensor {
+        let tensor = tensor.to_kind(self.kind);
+        self.entries.push((name, tensor.shallow_clone()));
+        tensor
+    }
+
+    fn uniform(&mut self, shape: &[i64], bound: f64) -> Tensor {
+        match &mut self.rng {
+            Some(rng) if bound > 0.0 => {
+                let len = shape.iter().product::<i64>() as usize;
+                let bound = bound as f32;
+                let values: Vec<f32> = (0..len).map(|_| rng.random_range(-bound..bound)).collect();
+                Tensor::from_slice(&values).view(shape)
+            }
+            _ => Tensor::zeros(shape, (Kind::Float, Device::Cpu)),
+        }
+    }
+
+    /// A single number.
+    pub fn scalar(&mut self, name: &str, value: f64) -> Tensor {
+        let tensor = Tensor::full([1], value, (Kind::Float, Device::Cpu));
+        self.add(name.into(), tensor)
+    }
+
+    /// A convolution with bias, padded so that at stride 1 the size stays.
+    pub fn conv(
+        &mut self,
+        name: &str,
+        [inputs, outputs]: [usize; 2],
+        kernel: usize,
+        stride: usize,
+        init: Init,
+    ) -> Conv {
+        let area = kernel * kernel;
+        let (fan_in, fan_out) = ((inputs * area) as f64, (outputs * area) as f64);
+        let (weight_bound, bias_bound) = match init {
+            Init::FanIn => (fan_in.sqrt().recip(), fan_in.sqrt().recip()),
+            Init::Glorot => ((6.0 / (fan_in + fan_out)).sqrt(), 0.0),
+            Init::Zero => (0.0, 0.0),
+        };
+        let [inputs, outputs, size] = [inputs, outputs, kernel].map(|size| size as i64);
+        let weight = self.uniform(&[outputs, inputs, size, size], weight_bound);
+        let bias = self.uniform(&[outputs], bias_bound);
+        Conv {
+            weight: self.add(format!("{name}.weight"), weight),
+            bias: self.add(format!("{name}.bias"), bias),
+            stride: stride as i64,
+            // A 4x4 kernel of stride 2 is padded by 1, a 3x3 one too, a 1x1 one by 0.
+            padding: (size - 1) / 2,
+        }
+    }
+
+    /// Moves all weights into one flat tensor, of which they stay views.
+    pub fn finish(self) -> Parameters {
+        let flats: Vec<Tensor> = self
+            .entries
+            .iter()
+            .map(|(_, tensor)| tensor.flatten(0, -1))
+            .collect();
+        let flat = Tensor::cat(&flats, 0).to_device(self.device);
+        let mut offset = 0;
+        let mut entries = self.entries;
+        for (_, tensor) in &mut entries {
+            let len = tensor.numel() as i64;
+            let view = flat.narrow(0, offset, len).view(tensor.size().as_slice());
+            tensor.set_data(&view);
+            offset += len;
+        }
+        Parameters { entries, flat }
+    }
+}
+
+/// Named weights, all views of one flat tensor.
+#[derive(Debug)]
+pub(crate) struct Parameters {
+    /// In a fixed order.
+    pub entries: Vec<(String, Tensor)>,
+    /// All of them, one after the other.
+    pub flat: Tensor,
+}
+
+impl Parameters {
+    /// How many numbers there are.
+    pub fn len(&self) -> usize {
+        self.flat.numel()
+    }
+
+    /// From now on gradients reach the weights.
+    pub fn require_gradients(&self) -> Vec<Tensor> {
+        let tensors = self.entries.iter();
+        tensors
+            .map(|(_, tensor)| tensor.shallow_clone().set_requires_grad(true))
+            .collect()
+    }
+}
+
+/// A convolution.
+#[derive(Debug)]
+pub(crate) struct Conv {
+    weight: Tensor,
+    bias: Tensor,
+    stride: i64,
+    padding: i64,
+}
+
+impl Conv {
+    /// Convolves in the kind of `x`.
+    pub fn forward(&self, x: &Tensor) -> Tensor {
+        let [weight, bias] = [&self.weight, &self.bias].map(|tensor| tensor.to_kind(x.kind()));
+        let (stride, padding) = ([self.stride; 2], [self.padding; 2]);
+        x.conv2d(&weight, Some(&bias), stride, padding, [1, 1], 1)
+    }
+}
+
+/// Twice as many rows and columns, bilinear between the centres of cells.
+pub(crate) fn upsample(x: &Tensor) -> Tensor {
+    let size = x.size();
+    x.upsample_bilinear2d([2 * size[2], 2 * size[3]], false, None, None)
+}

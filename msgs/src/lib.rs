@@ -7,8 +7,9 @@
 
 pub mod bounded;
 mod cdr;
+pub mod convert;
 mod interface;
-#[allow(clippy::all)]
+#[allow(clippy::all, rustdoc::bare_urls)]
 mod interfaces {
     include!(concat!(env!("OUT_DIR"), "/interfaces.rs"));
 }

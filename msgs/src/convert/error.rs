@@ -1,0 +1,94 @@
+//! What can be wrong with a message.
+
+/// A message that cannot be converted.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+pub enum ConvertError {
+    /// A sequence has another length than other fields ask for.
+    #[error("{field} has {actual} elements, expected {expected}")]
+    Size {
+        /// The field.
+        field: &'static str,
+        /// Elements found.
+        actual: usize,
+        /// Elements expected.
+        expected: usize,
+    },
+    /// A number is infinite or not a number.
+    #[error("{field} is not finite, expected a finite number")]
+    NotFinite {
+        /// The field.
+        field: &'static str,
+    },
+    /// An element of a sequence is infinite or not a number.
+    #[error("{field}[{index}] is not finite, expected a finite number")]
+    ElementNotFinite {
+        /// The field.
+        field: &'static str,
+        /// Index of the first such element.
+        index: usize,
+    },
+    /// Any other value that is out of range or not known.
+    #[error("{field} is {actual}, expected {expected}")]
+    Unexpected {
+        /// The field.
+        field: &'static str,
+        /// The value found.
+        actual: String,
+        /// What would do.
+        expected: String,
+    },
+    /// Points that make no trajectory.
+    #[error("trajectory points: {0}")]
+    Trajectory(#[from] ur5::PlanError),
+}
+
+pub(super) fn unexpected(
+    field: &'static str,
+    actual: impl std::fmt::Display,
+    expected: impl Into<String>,
+) -> ConvertError {
+    ConvertError::Unexpected {
+        field,
+        actual: actual.to_string(),
+        expected: expected.into(),
+    }
+}
+
+pub(super) fn finite(field: &'static str, value: f64) -> Result<f64, ConvertError> {
+    if value.is_finite() {
+        Ok(value)
+    } else {
+        Err(ConvertError::NotFinite { field })
+    }
+}
+
+pub(super) fn all_finite(field: &'static str, values: &[f64]) -> Result<(), ConvertError> {
+    match values.iter().position(|value| !value.is_finite()) {
+        Some(index) => Err(ConvertError::ElementNotFinite { field, index }),
+        None => Ok(()),
+    }
+}
+
+pub(super) fn positive(field: &'static str, value: f64) -> Result<f64, ConvertError> {
+    if finite(field, value)? > 0.0 {
+        Ok(value)
+    } else {
+        Err(unexpected(field, value, "a positive number"))
+    }
+}
+
+pub(super) fn size(
+    field: &'static str,
+    actual: usize,
+    expected: usize,
+) -> Result<(), ConvertError> {
+    if actual == expected {
+        Ok(())
+    } else {
+        Err(ConvertError::Size {
+            field,
+            actual,
+            expected,
+        })
+    }
+}

@@ -6,7 +6,7 @@ use crate::render::RenderError;
 use crate::tasks::Task;
 use heightmap::{Fusion, FusionError, Heightmap, View, Workspace};
 use nalgebra::Isometry2;
-use pick_place::{Outcome, PickPlace, PrimitiveSettings};
+use pick_place::{ExecuteError, Outcome, PickPlace, PrimitiveSettings};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use std::time::Duration;
@@ -106,6 +106,9 @@ pub enum EnvironmentError {
     /// The simulated hardware refused.
     #[error(transparent)]
     Cell(#[from] CellError),
+    /// The primitive could not start or go on.
+    #[error(transparent)]
+    Primitive(#[from] ExecuteError<CellError>),
     /// A camera's image could not be rendered.
     #[error(transparent)]
     Render(#[from] RenderError),

@@ -130,6 +130,17 @@ impl TaskModule for Placing {
         anchor: &Isometry2<f64>,
         rng: &mut ChaCha8Rng,
     ) -> Box<dyn Task> {
+        Box::new(self.draw(world, anchor, rng))
+    }
+}
+
+impl Placing {
+    fn draw(
+        &self,
+        world: &mut World,
+        anchor: &Isometry2<f64>,
+        rng: &mut ChaCha8Rng,
+    ) -> PlacingTask {
         world.add(&Part {
             shape: Shape::Cuboid {
                 size_m: Vector3::new(PLATE_M, PLATE_M, PLATE_HEIGHT_M),
@@ -180,12 +191,12 @@ impl TaskModule for Placing {
                 even: index % 2 == 0,
             }
         });
-        Box::new(PlacingTask {
+        PlacingTask {
             disks,
             cells: cells.collect(),
             yaw_rad: anchor.rotation.angle(),
             parameters: self.parameters,
-        })
+        }
     }
 }
 
@@ -308,5 +319,184 @@ impl Task for PlacingTask {
             pick: Isometry2::new(center.coords + offset, 0.0),
             place: Isometry2::new(cell.center.coords + offset, 0.0),
         })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+    use rand::SeedableRng;
+
+    const TIP_AWAY_M: f64 = 0.5;
+
+    fn away() -> Isometry3<f64> {
+        Isometry3::translation(0.0, 0.0, TIP_AWAY_M)
+    }
+
+    fn scene(seed: u64) -> (World, PlacingTask) {
+        let mut world = World::new(&away());
+        let placing = Placing {
+            parameters: Parameters::default(),
+        };
+        let anchor = Isometry2::new(Vector2::new(0.5, 0.05), 0.3);
+        let mut rng = ChaCha8Rng::seed_from_u64(seed);
+        let task = placing.draw(&mut world, &anchor, &mut rng);
+        (world, task)
+    }
+
+    /// Puts a disk's centre at a height over the point `off` metres from a cell's centre.
+    fn put(world: &mut World, task: &PlacingTask, disk: usize, cell: usize, off: f64, z: f64) {
+        let at = task.cells[cell].center + Vector2::new(off, 0.0);
+        world.place(
+            task.disks[disk].body,
+            &Isometry3::translation(at.x, at.y, z),
+        );
+    }
+
+    fn rest(world: &mut World) {
+        for _ in 0..480 {
+            world.step(&away());
+        }
+        assert!(world.fastest_m_s() < 5e-3);
+    }
+
+    const ON_PLATE_M: f64 = PLATE_HEIGHT_M + DISK_HEIGHT_M / 2.0 + 1e-4;
+    /// Disks 0 to 4 are even, 5 to 8 odd: a cell for each.
+    const SOLUTION: [usize; 9] = [0, 2, 4, 6, 8, 1, 3, 5, 7];
+
+    #[test]
+    fn nine_disks_on_their_cells_earn_everything() {
+        let (mut world, mut task) = scene(3);
+        assert_eq!(task.reached(&world), 0);
+        for (count, (disk, cell)) in SOLUTION.iter().enumerate().enumerate() {
+            put(&mut world, &task, disk, *cell, 0.003, ON_PLATE_M);
+            rest(&mut world);
+            assert_eq!(task.reached(&world), count + 1);
+        }
+        let mut rng = ChaCha8Rng::seed_from_u64(0);
+        assert_eq!(task.demonstrate(&world, &mut rng), None);
+    }
+
+    #[test]
+    fn a_disk_on_a_disk_earns_nothing() {
+        let (mut world, mut task) = scene(3);
+        put(&mut world, &task, 0, 0, 0.0, ON_PLATE_M);
+        put(
+            &mut world,
+            &task,
+            1,
+            0,
+            0.0,
+            ON_PLATE_M + DISK_HEIGHT_M + 1e-4,
+        );
+        rest(&mut world);
+        assert_eq!(task.reached(&world), 1);
+        // An even disk on an odd one covers an even cell without lying on it.
+        put(&mut world, &task, 5, 4, 0.0, ON_PLATE_M);
+        put(
+            &mut world,
+            &task,
+            2,
+            4,
+            0.0,
+            ON_PLATE_M + DISK_HEIGHT_M + 1e-4,
+        );
+        rest(&mut world);
+        assert_eq!(task.reached(&world), 1);
+    }
+
+    #[test]
+    fn a_disk_of_the_wrong_parity_earns_nothing() {
+        let (mut world, mut task) = scene(3);
+        put(&mut world, &task, 0, 1, 0.0, ON_PLATE_M);
+        put(&mut world, &task, 5, 0, 0.0, ON_PLATE_M);
+        rest(&mut world);
+        assert_eq!(task.reached(&world), 0);
+    }
+
+    #[test]
+    fn a_disk_too_far_from_its_cell_earns_nothing() {
+        let (mut world, mut task) = scene(3);
+        put(&mut world, &task, 0, 0, 0.011, ON_PLATE_M);
+        rest(&mut world);
+        assert_eq!(task.reached(&world), 0);
+        put(&mut world, &task, 0, 0, 0.009, ON_PLATE_M);
+        rest(&mut world);
+        assert_eq!(task.reached(&world), 1);
+    }
+
+    #[test]
+    fn disks_beside_the_plate_or_in_the_air_earn_nothing() {
+        let (mut world, mut task) = scene(3);
+        let beside = task.cells[0].center - Vector2::new(0.12, 0.0);
+        let z = DISK_HEIGHT_M / 2.0;
+        world.place(
+            task.disks[0].body,
+            &Isometry3::translation(beside.x, beside.y, z),
+        );
+        rest(&mut world);
+        put(&mut world, &task, 1, 2, 0.0, 0.1);
+        assert_eq!(task.reached(&world), 0);
+    }
+
+    #[test]
+    fn a_disk_on_its_edge_earns_nothing() {
+        let (mut world, mut task) = scene(3);
+        let at = task.cells[0].center;
+        let tilt = nalgebra::Vector3::new(std::f64::consts::FRAC_PI_2, 0.0, 0.0);
+        let pose = Isometry3::new(Vector3::new(at.x, at.y, ON_PLATE_M), tilt);
+        world.place(task.disks[0].body, &pose);
+        assert_eq!(task.reached(&world), 0);
+    }
+
+    #[test]
+    fn the_sizes_make_four_goal_configurations() {
+        let sizes = (0..40).map(|seed| {
+            let (_, task) = scene(seed);
+            [0, 8].map(|disk| task.disks[disk].radius_m == BIG_RADIUS_M)
+        });
+        let sizes: std::collections::BTreeSet<_> = sizes.collect();
+        assert_eq!(sizes.len(), 4);
+    }
+
+    proptest! {
+        #[test]
+        fn disks_start_apart_on_their_side_and_do_not_move(seed in 0u64..1_000_000) {
+            let (mut world, task) = scene(seed);
+            let anchor = Isometry2::new(Vector2::new(0.5, 0.05), 0.3);
+            let starts: Vec<_> = task.disks.iter().map(|d| world.position(d.body)).collect();
+            for (i, a) in task.disks.iter().enumerate() {
+                let local = anchor.inverse_transform_point(&starts[i].xy());
+                let side = if a.even { 1.0 } else { -1.0 };
+                prop_assert!(side * local.y > PLATE_M / 2.0 + a.radius_m);
+                prop_assert!(side * local.y + a.radius_m <= STRIP_M.1 + 1e-6);
+                prop_assert!(local.x.abs() + a.radius_m <= STRIP_LENGTH_M / 2.0 + 1e-6);
+                for (j, b) in task.disks.iter().enumerate().skip(i + 1) {
+                    let apart = (starts[i] - starts[j]).norm();
+                    prop_assert!(apart > a.radius_m + b.radius_m + 0.9 * START_GAP_M);
+                }
+            }
+            rest(&mut world);
+            for (disk, start) in task.disks.iter().zip(&starts) {
+                prop_assert!((world.position(disk.body) - start).norm() < 1e-3);
+            }
+        }
+
+        #[test]
+        fn the_demonstrator_brings_a_disk_onto_a_free_cell_of_its_parity(seed in 0u64..1_000_000) {
+            let (world, mut task) = scene(seed);
+            let mut rng = ChaCha8Rng::seed_from_u64(seed);
+            let action = task.demonstrate(&world, &mut rng).unwrap();
+            let pick = Point2::from(action.pick.translation.vector);
+            let disk = task.disks.iter().find(|d| {
+                (world.position(d.body).xy() - pick).norm() <= 0.25 * d.radius_m + 1e-9
+            });
+            let disk = disk.expect("picks near a disk's centre");
+            let center = world.position(disk.body).xy()
+                + (action.place.translation.vector - action.pick.translation.vector);
+            let cell = task.cells.iter().find(|c| (c.center - center).norm() < 1e-6);
+            prop_assert_eq!(cell.expect("places on a cell").even, disk.even);
+        }
     }
 }

@@ -3,6 +3,7 @@
 use crate::{PrimitiveSettings, SettingsError};
 use nalgebra::{Isometry2, Isometry3};
 use serde::{Deserialize, Serialize};
+use std::f64::consts::{FRAC_PI_2, PI};
 use ur5::{Arm, JointTrajectory, Joints, PlanError, Unreachable};
 
 /// An action: where the end effector grasps and where it releases, in the world's xy-plane
@@ -195,7 +196,11 @@ impl<'a> Primitive<'a> {
         let place = ceiling("place", &action.place, wanted_m)?;
         // The cup is round: only the turn from pick to place counts. Half of it before and half
         // after keeps wrist 3 away from its limits.
-        let half_turn = 0.5 * action.pick.rotation.angle_to(&action.place.rotation);
+        let mut half_turn = 0.5 * action.pick.rotation.angle_to(&action.place.rotation);
+        // A full half-circle may go either way. Begun from this side, both are within the limits.
+        if half_turn < -FRAC_PI_2 + 1e-6 {
+            half_turn += PI;
+        }
         let turned =
             |pose: &Isometry2<f64>, yaw_rad| Isometry2::new(pose.translation.vector, yaw_rad);
         Ok(Self {

@@ -501,3 +501,268 @@ fn step_count(total_s: f64) -> Result<usize, PlanError> {
         "the motion would take {total_s:.1} s"
     )))
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::WorkCell;
+    use nalgebra::{Isometry2, Vector2};
+    use proptest::prelude::*;
+
+    fn arm() -> Arm {
+        WorkCell::builtin().unwrap().arm
+    }
+
+    fn over(x: f64, y: f64, yaw_rad: f64, z_m: f64) -> Isometry3<f64> {
+        Arm::tip_down(&Isometry2::new(Vector2::new(x, y), yaw_rad), z_m)
+    }
+
+    fn tip_pose() -> impl Strategy<Value = Isometry3<f64>> {
+        // Without the corners, which the arm reaches only low.
+        (0.3..0.65f64, -0.4..0.4f64, -1.5..1.5f64, -0.01..0.2f64)
+            .prop_map(|(x, y, yaw_rad, z_m)| over(x, y, yaw_rad, z_m))
+    }
+
+    fn assert_within_joint_speeds(arm: &Arm, trajectory: &JointTrajectory) {
+        trajectory.check_limits(arm).unwrap();
+        for point in trajectory.points() {
+            let share = point
+                .velocities_rad_s
+                .component_div(&arm.max_speed_rad_s)
+                .amax();
+            assert!(share <= 1.0 + 1e-9, "{share}");
+        }
+    }
+
+    proptest! {
+        #![proptest_config(ProptestConfig::with_cases(100))]
+
+        #[test]
+        fn a_line_is_straight_within_a_tenth_of_a_millimetre(
+            start in tip_pose(), end in tip_pose(), speed in 0.05..1.0f64, acceleration in 0.5..5.0f64,
+        ) {
+            let arm = arm();
+            let from = arm.solve(&start, &arm.ready).unwrap();
+            let line = JointTrajectory::line(&arm, &from, &end, speed, acceleration).unwrap();
+            prop_assert_eq!(line.points()[0].time, Duration::ZERO);
+            prop_assert_eq!(line.points()[0].positions_rad, from);
+            prop_assert!((arm.tip(&line.last().positions_rad).to_homogeneous() - end.to_homogeneous()).amax() < 1e-9);
+            let way = end.translation.vector - start.translation.vector;
+            prop_assume!(way.norm() > 1e-3);
+            let mut sampler = line.sampler();
+            let mut before: Option<(f64, f64)> = None;
+            let tick_s = 1.0 / 480.0;
+            for tick in 0.. {
+                let time = Duration::from_secs_f64(f64::from(tick) * tick_s);
+                if time > line.duration() {
+                    break;
+                }
+                let state = sampler.state(time);
+                prop_assert_eq!(&state, &line.state(time));
+                let tip = arm.tip(&state.positions_rad).translation.vector;
+                let along = (tip - start.translation.vector).dot(&way) / way.norm();
+                let aside = (tip - start.translation.vector - way.normalize() * along).norm();
+                prop_assert!(aside < 1e-4, "{} m off the line", aside);
+                // Speed and acceleration by finite differences, with 5 % for their coarseness.
+                if let Some((last, last_speed)) = before {
+                    let present = (along - last) / tick_s;
+                    prop_assert!(present <= 1.05 * speed, "{} m/s", present);
+                    let change = (present - last_speed).abs() / tick_s;
+                    prop_assert!(tick == 1 || change <= 1.05 * acceleration + 0.1, "{} m/s2", change);
+                    before = Some((along, present));
+                } else {
+                    before = Some((along, 0.0));
+                }
+            }
+            assert_within_joint_speeds(&arm, &line);
+        }
+
+        #[test]
+        fn velocities_are_those_of_the_positions(start in tip_pose(), end in tip_pose()) {
+            let arm = arm();
+            let from = arm.solve(&start, &arm.ready).unwrap();
+            let line = JointTrajectory::line(&arm, &from, &end, 0.5, 2.0).unwrap();
+            // Three points of the path give the derivative in the middle one to second order.
+            for three in line.points().windows(3) {
+                let elapsed_s = (three[2].time - three[0].time).as_secs_f64();
+                let slope = (three[2].positions_rad - three[0].positions_rad) / elapsed_s;
+                prop_assert!((slope - three[1].velocities_rad_s).amax() < 0.05);
+            }
+        }
+
+        #[test]
+        fn joint_space_goes_straight_from_rest_to_rest(
+            from in prop::array::uniform6(-3.0..3.0f64), to in prop::array::uniform6(-3.0..3.0f64), tip_speed in 0.1..2.0f64,
+        ) {
+            let arm = arm();
+            let (from, to) = (Joints::from(from), Joints::from(to));
+            let way = JointTrajectory::joint_space_within(&arm, &from, &to, tip_speed).unwrap();
+            assert_within_joint_speeds(&arm, &way);
+            let (first, last) = (way.points()[0], *way.last());
+            prop_assert_eq!((first.positions_rad, last.positions_rad), (from, to));
+            prop_assert_eq!((first.velocities_rad_s, last.velocities_rad_s), (Joints::zeros(), Joints::zeros()));
+            for point in way.points() {
+                let share = (point.positions_rad - from).dot(&(to - from)) / (to - from).norm_squared();
+                prop_assert!((from + (to - from) * share - point.positions_rad).amax() < 1e-9);
+                let speed = (arm.jacobian(&point.positions_rad) * point.velocities_rad_s).fixed_rows::<3>(0).norm();
+                prop_assert!(speed < 1.02 * tip_speed, "{}", speed);
+            }
+            let free = JointTrajectory::joint_space(&arm, &from, &to).unwrap();
+            prop_assert!(free.duration() <= way.duration());
+        }
+
+        #[test]
+        fn limits_hold_between_points_too(q0 in -1.0..1.0f64, q1 in -1.0..1.0f64, v0 in -3.0..3.0f64, v1 in -3.0..3.0f64) {
+            let point = |time, q, v| TrajectoryPoint {
+                time: Duration::from_secs_f64(time),
+                positions_rad: Joints::repeat(q),
+                velocities_rad_s: Joints::repeat(v),
+            };
+            let trajectory = JointTrajectory::new(vec![point(0.0, q0, v0), point(1.0, q1, v1)]).unwrap();
+            let states: Vec<_> = (0..=1000).map(|i| trajectory.state(Duration::from_millis(i))).collect();
+            let range = |value: &dyn Fn(&TrajectoryPoint) -> f64| {
+                states.iter().map(value).fold((f64::INFINITY, f64::NEG_INFINITY), |(low, high), value| (low.min(value), high.max(value)))
+            };
+            let (low, high) = range(&|state| state.positions_rad[0]);
+            let mut arm = arm();
+            arm.max_speed_rad_s = Joints::repeat(100.0);
+            let margin = 1e-4;
+            arm.limits_rad = (Joints::repeat(low - margin), Joints::repeat(high + margin));
+            prop_assert!(trajectory.check_limits(&arm).is_ok());
+            arm.limits_rad.0 = Joints::repeat(low + margin);
+            prop_assert!(trajectory.check_limits(&arm).is_err());
+            arm.limits_rad = (Joints::repeat(low - margin), Joints::repeat(high - margin));
+            prop_assert!(trajectory.check_limits(&arm).is_err());
+        }
+    }
+
+    #[test]
+    fn a_half_turn_on_the_spot_takes_its_time() {
+        let arm = arm();
+        let from = arm.solve(&over(0.5, 0.0, -1.5, 0.1), &arm.ready).unwrap();
+        let turn = JointTrajectory::line(&arm, &from, &over(0.5, 0.0, 1.6, 0.1), 0.5, 3.0).unwrap();
+        assert!(
+            turn.duration() > Duration::from_millis(600),
+            "{:?}",
+            turn.duration()
+        );
+        assert!((turn.last().positions_rad - from)[5].abs() > 3.0);
+    }
+
+    #[test]
+    fn a_line_to_where_the_tip_is_takes_one_step() {
+        let arm = arm();
+        let from = arm.solve(&over(0.5, 0.0, 0.0, 0.1), &arm.ready).unwrap();
+        let stay = JointTrajectory::line(&arm, &from, &arm.tip(&from), 0.5, 3.0).unwrap();
+        assert!((stay.last().positions_rad - from).amax() < 1e-9);
+        let stay = JointTrajectory::joint_space(&arm, &from, &from).unwrap();
+        assert_eq!(stay.points().len(), 2);
+    }
+
+    #[test]
+    fn a_line_that_passes_too_near_the_base_is_slowed_down() {
+        let arm = arm();
+        let from = arm.solve(&over(0.25, -0.2, 0.0, 0.1), &arm.ready).unwrap();
+        let line =
+            JointTrajectory::line(&arm, &from, &over(0.25, 0.2, 0.0, 0.1), 1.5, 10.0).unwrap();
+        assert_within_joint_speeds(&arm, &line);
+        assert!(line.duration() > Duration::from_millis(500));
+    }
+
+    #[test]
+    fn a_line_out_of_reach_or_through_a_singularity_is_an_error() {
+        let arm = arm();
+        let from = arm.solve(&over(0.6, 0.0, 0.0, 0.1), &arm.ready).unwrap();
+        let far = JointTrajectory::line(&arm, &from, &over(1.3, 0.0, 0.0, 0.1), 0.5, 2.0);
+        assert!(matches!(far, Err(PlanError::Unreachable(_))), "{far:?}");
+        // Straight through the base's axis.
+        let through = JointTrajectory::line(&arm, &from, &over(-0.6, 0.0, 0.0, 0.1), 0.5, 2.0);
+        assert!(through.is_err());
+        // Tool horizontal and sideways: wrist 1 and wrist 3 become parallel on the way.
+        let folded = Joints::new(0.0, -1.5, 1.6, -1.7, -0.3, 0.0);
+        let mut to = arm.tip(&Joints::new(0.0, -1.5, 1.6, -1.7, 0.3, 0.0));
+        to.translation.z += 0.02;
+        let flips = JointTrajectory::line(&arm, &folded, &to, 0.5, 2.0);
+        assert!(
+            matches!(flips, Err(PlanError::Singular { .. })),
+            "{flips:?}"
+        );
+    }
+
+    #[test]
+    fn bad_requests_are_refused_by_name() {
+        let arm = arm();
+        let from = arm.ready;
+        let to = arm.tip(&from);
+        for (speed, acceleration, name) in [
+            (0.0, 1.0, "speed"),
+            (f64::NAN, 1.0, "speed"),
+            (1.0, -1.0, "acceleration"),
+            (1e-9, 1.0, "would take"),
+        ] {
+            let to = over(0.5, 0.1, 0.0, 0.1);
+            let error = JointTrajectory::line(&arm, &from, &to, speed, acceleration).unwrap_err();
+            assert!(error.to_string().contains(name), "{error}");
+        }
+        let outside = Joints::repeat(10.0);
+        let error = JointTrajectory::line(&arm, &outside, &to, 1.0, 1.0).unwrap_err();
+        assert!(error.to_string().contains("limits"), "{error}");
+        assert!(JointTrajectory::joint_space(&arm, &from, &outside).is_err());
+        assert!(JointTrajectory::joint_space(&arm, &Joints::repeat(f64::NAN), &from).is_err());
+        let mut nowhere = to;
+        nowhere.translation.x = f64::NAN;
+        assert!(JointTrajectory::line(&arm, &from, &nowhere, 1.0, 1.0).is_err());
+    }
+
+    #[test]
+    fn hostile_points_are_refused_with_a_reason() {
+        let point = |ms| TrajectoryPoint {
+            time: Duration::from_millis(ms),
+            positions_rad: Joints::zeros(),
+            velocities_rad_s: Joints::zeros(),
+        };
+        let refusal = |points| JointTrajectory::new(points).unwrap_err().to_string();
+        assert!(refusal(vec![]).contains("no points"));
+        assert!(refusal(vec![point(0), point(0)]).contains("point 1"));
+        assert!(refusal(vec![point(5), point(9), point(7)]).contains("point 2"));
+        let mut bad = point(4);
+        bad.positions_rad[3] = f64::NAN;
+        assert!(refusal(vec![point(0), bad]).contains("positions of point 1 are not finite"));
+        let mut bad = point(4);
+        bad.velocities_rad_s[3] = f64::INFINITY;
+        assert!(refusal(vec![bad]).contains("velocities of point 0"));
+        assert!(refusal((0..=10_000).map(point).collect()).contains("10001 points"));
+        assert!(refusal(vec![point(0), point(u64::MAX / 2_000_000)]).contains("at most"));
+        assert!(JointTrajectory::new(vec![point(0)]).is_ok());
+        assert!(JointTrajectory::new((0..10_000).map(point).collect()).is_ok());
+    }
+
+    #[test]
+    fn points_that_are_too_fast_or_beyond_the_limits_are_named() {
+        let arm = arm();
+        let point = |ms, elbow| {
+            let mut positions_rad = Joints::zeros();
+            positions_rad[2] = elbow;
+            TrajectoryPoint {
+                time: Duration::from_millis(ms),
+                positions_rad,
+                velocities_rad_s: Joints::zeros(),
+            }
+        };
+        let check = |points| JointTrajectory::new(points).unwrap().check_limits(&arm);
+        assert_eq!(check(vec![point(0, 0.0), point(1000, 1.0)]), Ok(()));
+        let error = check(vec![point(0, 0.0), point(100, 1.0)])
+            .unwrap_err()
+            .to_string();
+        assert!(
+            error.contains("joint 2 turns at 15.000 rad/s after point 0"),
+            "{error}"
+        );
+        let error = check(vec![point(0, 0.0), point(5000, 3.2)])
+            .unwrap_err()
+            .to_string();
+        assert!(error.contains("joint 2 goes to"), "{error}");
+        let error = check(vec![point(0, -3.2)]).unwrap_err().to_string();
+        assert!(error.contains("after point 0"), "{error}");
+    }
+}

@@ -1,7 +1,7 @@
 //! The work cell from urdf/.
 
 use crate::{Arm, DhLengths, Joints};
-use nalgebra::{Isometry3, Translation3, UnitQuaternion, Vector3};
+use nalgebra::{Isometry3, Point3, Translation3, UnitQuaternion, Vector3};
 use std::collections::BTreeMap;
 use std::path::Path;
 use urdf_rs::{Geometry, JointType};
@@ -41,6 +41,38 @@ pub enum Shape {
         /// Radius.
         radius_m: f64,
     },
+}
+
+impl Shape {
+    /// Distance in m from a point in the shape's frame to its surface, negative inside.
+    pub fn distance_m(&self, point: &Point3<f64>) -> f64 {
+        let outside =
+            |beyond: Vector3<f64>| beyond.sup(&Vector3::zeros()).norm() + beyond.max().min(0.0);
+        match self {
+            Self::Cuboid { size_m } => outside(point.coords.abs() - 0.5 * size_m),
+            Self::Cylinder { radius_m, length_m } => {
+                let radial = point.coords.xy().norm() - radius_m;
+                // Twice the same: a cylinder has two directions, not three.
+                outside(Vector3::new(
+                    radial,
+                    radial.min(0.0),
+                    point.z.abs() - 0.5 * length_m,
+                ))
+            }
+            Self::Sphere { radius_m } => point.coords.norm() - radius_m,
+        }
+    }
+
+    /// How far, in m, the shape reaches from its centre along a unit vector in its frame.
+    pub fn extent_m(&self, along: &Vector3<f64>) -> f64 {
+        match self {
+            Self::Cuboid { size_m } => 0.5 * along.abs().dot(size_m),
+            Self::Cylinder { radius_m, length_m } => {
+                radius_m * along.xy().norm() + 0.5 * length_m * along.z.abs()
+            }
+            Self::Sphere { radius_m } => *radius_m,
+        }
+    }
 }
 
 /// A shape on a link.
@@ -187,7 +219,7 @@ impl WorkCell {
     pub fn shapes<'a>(
         &'a self,
         joints: &Joints,
-    ) -> impl Iterator<Item = (&'a Body, Isometry3<f64>)> {
+    ) -> impl Iterator<Item = (&'a Body, Isometry3<f64>)> + use<'a> {
         self.posed(&self.visuals, joints)
     }
 

@@ -1,0 +1,376 @@
+//! The cell of urdf/workcell.urdf: what it says, and that the arm fits into it.
+
+use nalgebra::{
+    Isometry2, Isometry3, Point3, Quaternion, Translation3, Unit, UnitQuaternion, Vector2, Vector3,
+};
+use proptest::prelude::*;
+use std::path::Path;
+use ur5::{Arm, Body, DhLengths, JointTrajectory, Joints, Shape, WorkCell};
+
+const URDF: &str = concat!(env!("CARGO_MANIFEST_DIR"), "/../../urdf/workcell.urdf");
+
+fn cell() -> WorkCell {
+    WorkCell::load(Path::new(URDF)).unwrap()
+}
+
+/// Poses over the workspace of 0.5 x 1 m, tool down.
+fn grid(heights_m: &[f64]) -> Vec<Isometry3<f64>> {
+    let mut poses = Vec::new();
+    for x in 0..=5 {
+        for y in 0..=10 {
+            let at = Vector2::new(0.25 + 0.1 * f64::from(x), -0.5 + 0.1 * f64::from(y));
+            for height_m in heights_m {
+                poses.push(Arm::tip_down(&Isometry2::new(at, 0.0), *height_m));
+            }
+        }
+    }
+    poses
+}
+
+/// The generic way: every joint of the file in turn, knowing nothing of a UR5.
+fn pose_by_urdf(
+    robot: &urdf_rs::Robot,
+    link: &str,
+    angles: &dyn Fn(&str) -> f64,
+) -> Isometry3<f64> {
+    let Some(joint) = robot.joints.iter().find(|joint| joint.child.link == link) else {
+        return Isometry3::identity();
+    };
+    let [x, y, z] = joint.origin.xyz.0;
+    let [roll, pitch, yaw] = joint.origin.rpy.0;
+    let origin = Isometry3::from_parts(
+        Translation3::new(x, y, z),
+        UnitQuaternion::from_euler_angles(roll, pitch, yaw),
+    );
+    let axis = Unit::new_normalize(Vector3::from(joint.axis.xyz.0));
+    let turn = UnitQuaternion::from_axis_angle(&axis, angles(&joint.name));
+    pose_by_urdf(robot, &joint.parent.link, angles) * origin * turn
+}
+
+proptest! {
+    #[test]
+    fn forward_kinematics_agrees_with_the_urdf(q in prop::array::uniform6(-6.28..6.28f64)) {
+        let cell = cell();
+        let robot = urdf_rs::read_file(URDF).unwrap();
+        let angles = |name: &str| cell.joint_names.iter().position(|joint| joint == name).map_or(0.0, |i| q[i]);
+        let expected = pose_by_urdf(&robot, "suction_tip", &angles).to_homogeneous();
+        let tip = cell.arm.tip(&Joints::from(q)).to_homogeneous();
+        prop_assert!((tip - expected).amax() < 1e-12, "{tip} {expected}");
+        let mut bodies = cell.shapes(&Joints::from(q));
+        for link in &robot.links {
+            for visual in &link.visual {
+                let (body, pose) = bodies.next().unwrap();
+                prop_assert_eq!(&body.link, &link.name);
+                let at = Point3::from(visual.origin.xyz.0);
+                let expected = pose_by_urdf(&robot, &link.name, &angles) * at;
+                prop_assert!((pose.translation.vector - expected.coords).norm() < 1e-12);
+            }
+        }
+        prop_assert!(bodies.next().is_none());
+    }
+}
+
+#[test]
+fn the_compiled_in_cell_is_the_one_in_the_file() {
+    let (builtin, file) = (WorkCell::builtin().unwrap(), cell());
+    assert_eq!(builtin.visuals, file.visuals);
+    assert_eq!(builtin.cameras, file.cameras);
+}
+
+#[test]
+fn the_arm_has_the_published_lengths_of_a_ur5() {
+    assert_eq!(cell().arm.lengths, DhLengths::UR5);
+    let names = [
+        "shoulder_pan_joint",
+        "shoulder_lift_joint",
+        "elbow_joint",
+        "wrist_1_joint",
+        "wrist_2_joint",
+        "wrist_3_joint",
+    ];
+    assert_eq!(cell().joint_names, names);
+}
+
+#[test]
+fn the_cameras_are_those_of_ravens() {
+    let expected = [
+        (
+            "front",
+            [1.0, 0.0, 0.75],
+            [0.65328, 0.65328, -0.2706, -0.2706],
+            [0.25, 0.0],
+        ),
+        (
+            "left",
+            [0.0, 0.5, 0.75],
+            [-0.3596, 0.86816, -0.31599, 0.13089],
+            [0.445, 0.055],
+        ),
+        (
+            "right",
+            [0.0, -0.5, 0.75],
+            [-0.86816, 0.3596, -0.13089, 0.31599],
+            [0.445, -0.055],
+        ),
+    ];
+    let cell = cell();
+    assert_eq!(cell.cameras.len(), 3);
+    for ((name, pose), (expected_name, [x, y, z], [i, j, k, w], looks_at)) in
+        cell.cameras.iter().zip(expected)
+    {
+        assert_eq!(name, expected_name);
+        assert_eq!(pose.translation.vector, Vector3::new(x, y, z));
+        let rotation = UnitQuaternion::from_quaternion(Quaternion::new(w, i, j, k));
+        assert!(pose.rotation.angle_to(&rotation) < 1e-4, "{name}");
+        let forward = pose.rotation * Vector3::z();
+        let hit = pose.translation.vector - forward * (z / forward.z);
+        assert!(
+            (hit.xy() - Vector2::from(looks_at)).norm() < 1e-3,
+            "{name} {hit}"
+        );
+    }
+}
+
+#[test]
+fn the_top_of_the_table_is_zero_and_holds_the_workspace() {
+    let cell = cell();
+    let (table, pose) = cell
+        .shapes(&cell.arm.home)
+        .find(|(body, _)| body.link == "table")
+        .unwrap();
+    assert_eq!(
+        pose.translation.z + table.shape.extent_m(&Vector3::z()),
+        0.0
+    );
+    for tip in grid(&[-1e-3]) {
+        let point = Point3::from(tip.translation.vector);
+        assert!(
+            table
+                .shape
+                .distance_m(&pose.inverse_transform_point(&point))
+                < 0.0
+        );
+    }
+}
+
+#[test]
+fn at_home_nothing_stands_between_a_camera_and_the_workspace() {
+    let cell = cell();
+    let bodies: Vec<_> = cell
+        .shapes(&cell.arm.home)
+        .filter(|(body, _)| body.link != "table")
+        .collect();
+    assert!(
+        bodies
+            .iter()
+            .filter(|(body, _)| body.moving_link.is_some())
+            .count()
+            > 15
+    );
+    let margin_m = 0.01;
+    for (name, camera) in &cell.cameras {
+        let eye = Point3::from(camera.translation.vector);
+        for tip in grid(&[0.0, 0.1, 0.2, 0.28]) {
+            let way = tip.translation.vector - eye.coords;
+            let length_m = way.norm();
+            // From just before the lens, in steps that distances allow to take at once.
+            let mut travelled_m = 0.02;
+            while travelled_m < length_m {
+                let point = eye + way * (travelled_m / length_m);
+                let (nearest, distance_m) = nearest(&bodies, &point);
+                assert!(
+                    distance_m > margin_m,
+                    "{} hides {} from the {name} camera",
+                    nearest.link,
+                    tip.translation
+                );
+                travelled_m += distance_m - 0.5 * margin_m;
+            }
+        }
+    }
+}
+
+fn nearest<'a>(bodies: &[(&'a Body, Isometry3<f64>)], point: &Point3<f64>) -> (&'a Body, f64) {
+    bodies
+        .iter()
+        .map(|(body, pose)| {
+            (
+                *body,
+                body.shape.distance_m(&pose.inverse_transform_point(point)),
+            )
+        })
+        .min_by(|a, b| a.1.total_cmp(&b.1))
+        .unwrap()
+}
+
+/// Joint positions on the ways from home to everywhere over the workspace, ends included.
+fn ways_from_home(cell: &WorkCell) -> Vec<(Joints, Isometry3<f64>)> {
+    let arm = &cell.arm;
+    let mut positions = vec![(arm.home, arm.tip(&arm.home))];
+    for tip in grid(&[0.0, 0.06, 0.1, 0.16, 0.24]) {
+        // The far corners are out of reach higher up.
+        let Ok(joints) = arm.solve(&tip, &arm.ready) else {
+            assert!(
+                tip.translation.vector.xy().norm() > 0.78 && tip.translation.z > 0.06,
+                "{tip}"
+            );
+            continue;
+        };
+        let way = JointTrajectory::joint_space(arm, &arm.home, &joints).unwrap();
+        for step in 0..=20 {
+            positions.push((way.sample(way.duration() * step / 20), tip));
+        }
+    }
+    positions
+}
+
+#[test]
+fn on_the_way_from_home_no_link_hits_table_camera_or_another_link() {
+    let cell = cell();
+    for (joints, end) in ways_from_home(&cell) {
+        let tip = cell.arm.tip(&joints);
+        assert!(
+            tip.translation.z > end.translation.z - 0.01,
+            "the tip dips to {} on the way to {}",
+            tip.translation,
+            end.translation
+        );
+        let bodies: Vec<_> = cell.posed(&cell.collisions, &joints).collect();
+        for (body, pose) in bodies.iter().filter(|(body, _)| body.moving_link.is_some()) {
+            let down = pose.inverse_transform_vector(&-Vector3::z());
+            let lowest_m = pose.translation.z - body.shape.extent_m(&down);
+            assert!(lowest_m > -1e-3, "{} goes down to {lowest_m} m", body.link);
+            for (name, camera) in &cell.cameras {
+                let eye = pose.inverse_transform_point(&Point3::from(camera.translation.vector));
+                assert!(
+                    body.shape.distance_m(&eye) > 0.15,
+                    "{} nears the {name} camera",
+                    body.link
+                );
+            }
+            for (other, other_pose) in &bodies {
+                // Neighbours touch by design; table and cameras are checked above.
+                let fixed = other.moving_link.is_none() && other.link != "base_link_inertia";
+                let index = |body: &Body| body.moving_link.map_or(0, |link| link + 1);
+                if fixed || index(body).abs_diff(index(other)) < 2 {
+                    continue;
+                }
+                for point in surface(&body.shape) {
+                    let point = other_pose.inverse_transform_point(&(pose * point));
+                    let distance_m = other.shape.distance_m(&point);
+                    assert!(distance_m > 0.0, "{} meets {}", body.link, other.link);
+                }
+            }
+        }
+    }
+}
+
+/// Points on a cylinder.
+fn surface(shape: &Shape) -> impl Iterator<Item = Point3<f64>> {
+    let Shape::Cylinder { radius_m, length_m } = *shape else {
+        panic!("the arm is made of cylinders");
+    };
+    (0..12).flat_map(move |i| {
+        let (sin, cos) = (f64::from(i) * std::f64::consts::TAU / 12.0).sin_cos();
+        (0..=6).map(move |j| {
+            Point3::new(
+                radius_m * cos,
+                radius_m * sin,
+                length_m * (f64::from(j) / 6.0 - 0.5),
+            )
+        })
+    })
+}
+
+#[test]
+fn what_is_wrong_with_a_urdf_is_named() {
+    let text = std::fs::read_to_string(URDF).unwrap();
+    let refusal = |from: &str, to: &str| {
+        assert!(text.contains(from), "{from}");
+        let error = WorkCell::parse(&text.replace(from, to), "cell.urdf")
+            .unwrap_err()
+            .to_string();
+        assert!(error.starts_with("cell.urdf: "), "{error}");
+        error
+    };
+    let cases = [
+        ("xyz=\"-0.425 0 0\"", "xyz=\"-0.425 0.01 0\"", "elbow_joint"),
+        ("0 0 0.089159", "0.1 0 0.089159", "shoulder_pan_joint"),
+        (
+            "xyz=\"-0.425 0 0\"",
+            "xyz=\"-0.425 nan 0\"",
+            "elbow_joint is not finite",
+        ),
+        (
+            "xyz=\"-0.425 0 0\"",
+            "xyz=\"0 0 0\"",
+            "upper arm has no length",
+        ),
+        ("<link name=\"suction_tip\"/>", "", "suction_tip"),
+        (
+            "name=\"elbow_joint\" type=\"revolute\"",
+            "name=\"elbow_joint\" type=\"prismatic\"",
+            "elbow_joint is not revolute",
+        ),
+        (
+            "name=\"elbow_joint\" type=\"revolute\"",
+            "name=\"elbow_joint\" type=\"fixed\"",
+            "six moving joints",
+        ),
+        ("_camera_optical_frame", "_eye", "at least one camera"),
+        (
+            "<child link=\"table\"/>",
+            "<child link=\"base_link\"/>",
+            "hangs on both",
+        ),
+        (
+            "<parent link=\"world\"/><child link=\"table\"/>",
+            "<parent link=\"table\"/><child link=\"table\"/>",
+            "circle",
+        ),
+        (
+            "lower=\"-3.141592653589793\"",
+            "lower=\"4\"",
+            "limits of joint elbow_joint",
+        ),
+        (
+            "lower=\"-3.141592653589793\"",
+            "lower=\"2.9\"",
+            "exclude the home position",
+        ),
+        (
+            "<cylinder radius=\"0.01\"",
+            "<cylinder radius=\"-0.01\"",
+            "suction_gripper",
+        ),
+        (
+            "<box size=\"1.8 1.8 0.05\"/>",
+            "<mesh filename=\"table.stl\"/>",
+            "table",
+        ),
+        (
+            "<material name=\"rubber\"><color",
+            "<material name=\"gum\"><color",
+            "rubber",
+        ),
+        ("0.12 0.12 0.12 1", "12 12 12 1", "0..1"),
+        (
+            "<link name=\"flange\"/>",
+            "<link name=\"flange\"/><link name=\"flange\"/>",
+            "two links are named flange",
+        ),
+        ("parent link=\"tool0\"", "parent link=\"tool1\"", "tool1"),
+        ("</robot>", "", ""),
+    ];
+    for (from, to, expected) in cases {
+        let error = refusal(from, to);
+        assert!(
+            error.contains(expected),
+            "{error:?} does not name {expected:?}"
+        );
+    }
+    let error = WorkCell::load(Path::new("no/such.urdf"))
+        .unwrap_err()
+        .to_string();
+    assert!(error.starts_with("no/such.urdf: "), "{error}");
+}

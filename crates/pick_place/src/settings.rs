@@ -39,10 +39,10 @@ impl PrimitiveSettings {
     pub const RIGID: Self = Self {
         clearance_m: 0.24,
         lift_m: 0.2,
-        travel_m_s: 1.2,
-        carry_m_s: 0.6,
-        descend_m_s: 0.3,
-        acceleration_m_s2: 3.0,
+        travel_m_s: 1.5,
+        carry_m_s: 0.8,
+        descend_m_s: 0.35,
+        acceleration_m_s2: 4.0,
     };
 
     /// For chains of beads: low and slow, or joints open and beads jump over pegs.

@@ -1,1 +1,14 @@
 //! Node that poses as the UR driver and the cameras, backed by Rapier.
+//!
+//! Simulated time advances only while a goal is active, so that a seed and the same goals give the
+//! same states, frames and stamps, however slow the host. The wall clock decides only how often
+//! what is at rest is said again.
+
+mod driver;
+mod frames;
+mod node;
+mod parameters;
+mod workcell;
+
+pub use node::run;
+pub use parameters::SimWorkcellParameters;

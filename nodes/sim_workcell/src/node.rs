@@ -1,0 +1,541 @@
+//! Topics, services and actions, and the thread that owns the simulated hardware.
+
+use std::path::Path;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::sync::mpsc;
+use std::thread;
+use std::time::{Duration, Instant};
+
+use anyhow::Context as _;
+use msgs::control_msgs::{
+    FollowJointTrajectory, FollowJointTrajectoryFeedback, FollowJointTrajectoryResult,
+};
+use msgs::convert;
+use msgs::rosgraph_msgs::Clock;
+use msgs::sctn_msgs::Reward;
+use msgs::sensor_msgs::JointState;
+use msgs::std_msgs::{Bool, Header};
+use msgs::tf2_msgs::TFMessage;
+use msgs::trajectory_msgs::JointTrajectoryPoint;
+use msgs::ur_dashboard_msgs::{RobotMode, SafetyMode};
+use msgs::ur_msgs::{
+    FollowJointTrajectoryUntil, FollowJointTrajectoryUntilFeedback,
+    FollowJointTrajectoryUntilResult, IOStates, SetIO, SetIORequest, SetIOResponse,
+};
+use multiravens::{MotionEnd, Problem};
+use node_kit::{Level, NewGoal, Node, Publisher, Qos, RunningGoal};
+use tokio::sync::oneshot;
+use tracing::{error, info, warn};
+use ur5::{JointTrajectory, WorkCell};
+
+use crate::driver::{Failure, follow_trajectory, until_trajectory};
+use crate::frames::{CameraTopics, Frame, camera_transforms};
+use crate::parameters::SimWorkcellParameters;
+use crate::workcell::{Step, Wiring, Workcell};
+
+/// Commands that wait for the hardware's thread; more are refused.
+const WAITING_COMMANDS: usize = 64;
+/// Simulated time between feedback messages, as the driver's controllers have it.
+const FEEDBACK_PERIOD: Duration = Duration::from_millis(50);
+
+/// Runs the node until shutdown.
+pub async fn run(node: Node, parameters: SimWorkcellParameters) -> anyhow::Result<()> {
+    let problem = Problem::load(&parameters.problems_dir, &parameters.problem)?;
+    let work_cell = match parameters.urdf.as_path() {
+        path if path == Path::new("") => WorkCell::builtin(),
+        path => WorkCell::load(path),
+    }
+    .context("parameter urdf")?;
+    let wiring = Wiring {
+        suction_pin: parameters.suction_pin,
+        vacuum_pin: parameters.vacuum_pin,
+    };
+    let seed = parameters.seed;
+    let workcell = tokio::task::spawn_blocking({
+        let work_cell = work_cell.clone();
+        move || Workcell::new(&problem, &work_cell, seed, wiring)
+    })
+    .await
+    .context("setting up the episode")??;
+
+    let mut follow = node.action_server::<FollowJointTrajectory>(&parameters.follow_action)?;
+    let mut until = node.action_server::<FollowJointTrajectoryUntil>(&parameters.until_action)?;
+    let mut set_io = node.service_server::<SetIO>("io_and_status_controller/set_io")?;
+    let (sender, commands) = mpsc::sync_channel(WAITING_COMMANDS);
+    let stop = Arc::new(AtomicBool::new(false));
+    let hardware = Hardware::new(
+        &node,
+        parameters,
+        workcell,
+        work_cell,
+        commands,
+        Arc::clone(&stop),
+    )?;
+    let mut thread = node.spawn_blocking(move || hardware.run());
+
+    loop {
+        tokio::select! {
+            goal = follow.recv() => pass_on(&sender, Command::Follow(goal)),
+            goal = until.recv() => pass_on(&sender, Command::Until(goal)),
+            (id, request) = set_io.recv() => {
+                let (reply, replied) = oneshot::channel();
+                pass_on(&sender, Command::SetIo(request, reply));
+                // Dropped where the command was not taken.
+                let success = replied.await.unwrap_or(false);
+                set_io.respond(id, SetIOResponse { success });
+            }
+            ended = &mut thread => return ended.context("the hardware's thread panicked")?,
+            () = node.shutdown() => {
+                stop.store(true, Ordering::Release);
+                drop(sender);
+                return thread.await.context("the hardware's thread panicked")?;
+            }
+        }
+    }
+}
+
+fn pass_on(sender: &mpsc::SyncSender<Command>, command: Command) {
+    // A goal that is dropped is rejected, a request fails.
+    if sender.try_send(command).is_err() {
+        warn!("command refused: {WAITING_COMMANDS} others wait");
+    }
+}
+
+enum Command {
+    Follow(NewGoal<FollowJointTrajectory>),
+    Until(NewGoal<FollowJointTrajectoryUntil>),
+    SetIo(SetIORequest, oneshot::Sender<bool>),
+}
+
+/// A goal that is being carried out.
+enum Active {
+    Follow(RunningGoal<FollowJointTrajectory>),
+    Until(RunningGoal<FollowJointTrajectoryUntil>),
+}
+
+/// How a goal ends.
+enum End {
+    Motion(MotionEnd),
+    Failed(Failure),
+    Cancelled,
+}
+
+impl Active {
+    fn is_cancel_requested(&self) -> bool {
+        match self {
+            Self::Follow(goal) => goal.is_cancel_requested(),
+            Self::Until(goal) => goal.is_cancel_requested(),
+        }
+    }
+
+    fn feedback(&self, header: Header, joint_names: Vec<String>, point: JointTrajectoryPoint) {
+        // The arm is where it should be.
+        let error = JointTrajectoryPoint {
+            positions: vec![0.0; point.positions.len()],
+            velocities: vec![0.0; point.velocities.len()],
+            time_from_start: point.time_from_start.clone(),
+            ..Default::default()
+        };
+        match self {
+            Self::Follow(goal) => goal.feedback(FollowJointTrajectoryFeedback {
+                header,
+                joint_names,
+                desired: point.clone(),
+                actual: point,
+                error,
+                ..Default::default()
+            }),
+            Self::Until(goal) => goal.feedback(FollowJointTrajectoryUntilFeedback {
+                header,
+                joint_names,
+                desired: point.clone(),
+                actual: point,
+                error,
+            }),
+        }
+    }
+
+    fn end(self, end: End) {
+        let lag = || {
+            Failure::new(
+                FollowJointTrajectoryResult::PATH_TOLERANCE_VIOLATED,
+                format!(
+                    "the suction tip was more than {} m behind the arm",
+                    multiravens::MAX_LAG_M
+                ),
+            )
+        };
+        let (cancelled, failure, triggered) = match end {
+            End::Motion(MotionEnd::Reached) => (false, None, false),
+            End::Motion(MotionEnd::Contact) => (false, None, true),
+            End::Motion(MotionEnd::Lag) => (false, Some(lag()), false),
+            End::Failed(failure) => (false, Some(failure), false),
+            End::Cancelled => (true, None, false),
+        };
+        let failed = failure.is_some();
+        let (error_code, error_string) = match failure {
+            Some(Failure { code, reason }) => (code, reason),
+            None if cancelled => (0, "cancelled".to_owned()),
+            None => (0, String::new()),
+        };
+        match self {
+            Self::Follow(goal) => {
+                let result = FollowJointTrajectoryResult {
+                    error_code,
+                    error_string,
+                };
+                match (cancelled, failed) {
+                    (true, _) => goal.cancelled(result),
+                    (_, true) => goal.abort(result),
+                    _ => goal.succeed(result),
+                }
+            }
+            Self::Until(goal) => {
+                let result = FollowJointTrajectoryUntilResult {
+                    error_code,
+                    until_condition_result: if triggered {
+                        FollowJointTrajectoryUntilResult::TRIGGERED
+                    } else {
+                        FollowJointTrajectoryUntilResult::NOT_TRIGGERED
+                    },
+                    error_string,
+                };
+                match (cancelled, failed) {
+                    (true, _) => goal.cancelled(result),
+                    (_, true) => goal.abort(result),
+                    _ => goal.succeed(result),
+                }
+            }
+        }
+    }
+}
+
+/// The simulated hardware and where it speaks.
+struct Hardware {
+    node: Node,
+    parameters: SimWorkcellParameters,
+    workcell: Workcell,
+    work_cell: WorkCell,
+    commands: mpsc::Receiver<Command>,
+    stop: Arc<AtomicBool>,
+    clock: Publisher<Clock>,
+    joint_states: Publisher<JointState>,
+    io_states: Publisher<IOStates>,
+    reward: Publisher<Reward>,
+    cameras: Vec<CameraTopics>,
+    /// Latched, said once; kept so that late joiners hear them.
+    _tf_static: Publisher<TFMessage>,
+    _robot_mode: Publisher<RobotMode>,
+    _safety_mode: Publisher<SafetyMode>,
+    _program_running: Publisher<Bool>,
+    /// What the cameras saw at this rest.
+    frames: Vec<Frame>,
+    said_pins: IOStates,
+    next_status: Instant,
+    next_frames: Instant,
+}
+
+impl Hardware {
+    fn new(
+        node: &Node,
+        parameters: SimWorkcellParameters,
+        workcell: Workcell,
+        work_cell: WorkCell,
+        commands: mpsc::Receiver<Command>,
+        stop: Arc<AtomicBool>,
+    ) -> anyhow::Result<Self> {
+        let cameras = workcell.environment().cell().cameras();
+        let topics = cameras
+            .iter()
+            .map(|camera| CameraTopics::new(node, &camera.name));
+        let topics = topics.collect::<Result<_, _>>()?;
+        let tf_static = node.publisher("/tf_static", Qos::Latched)?;
+        tf_static.publish(camera_transforms(
+            cameras,
+            &parameters.world_frame,
+            workcell.time(),
+        )?);
+        let status = |name| format!("io_and_status_controller/{name}");
+        let robot_mode = node.publisher(&status("robot_mode"), Qos::Latched)?;
+        robot_mode.publish(RobotMode {
+            mode: RobotMode::RUNNING,
+        });
+        let safety_mode = node.publisher(&status("safety_mode"), Qos::Latched)?;
+        safety_mode.publish(SafetyMode {
+            mode: SafetyMode::NORMAL,
+        });
+        let program_running = node.publisher(&status("robot_program_running"), Qos::Latched)?;
+        program_running.publish(Bool { data: true });
+        Ok(Self {
+            clock: node.publisher("/clock", Qos::Event)?,
+            joint_states: node.publisher("joint_states", Qos::Event)?,
+            io_states: node.publisher(&status("io_states"), Qos::Event)?,
+            reward: node.publisher("reward", Qos::Event)?,
+            node: node.clone(),
+            said_pins: workcell.io_states(),
+            parameters,
+            workcell,
+            work_cell,
+            commands,
+            stop,
+            cameras: topics,
+            _tf_static: tf_static,
+            _robot_mode: robot_mode,
+            _safety_mode: safety_mode,
+            _program_running: program_running,
+            frames: Vec::new(),
+            next_status: Instant::now(),
+            next_frames: Instant::now(),
+        })
+    }
+
+    fn run(mut self) -> anyhow::Result<()> {
+        let (problem, seed) = (&self.parameters.problem, self.parameters.seed);
+        info!(
+            "problem {problem}, seed {seed}: ready at {:?}",
+            self.workcell.time()
+        );
+        self.look()?;
+        while !self.stop.load(Ordering::Acquire) {
+            let next = self.next_status.min(self.next_frames);
+            match self
+                .commands
+                .recv_timeout(next.saturating_duration_since(Instant::now()))
+            {
+                Ok(command) => self.obey(command)?,
+                Err(mpsc::RecvTimeoutError::Timeout) => {}
+                Err(mpsc::RecvTimeoutError::Disconnected) => break,
+            }
+            let now = Instant::now();
+            if now >= self.next_status {
+                self.say_status()?;
+                self.say_pins();
+            }
+            if now >= self.next_frames {
+                self.say_frames();
+            }
+        }
+        Ok(())
+    }
+
+    fn obey(&mut self, command: Command) -> anyhow::Result<()> {
+        let (arm, names) = (&self.work_cell.arm, &self.work_cell.joint_names);
+        match command {
+            Command::Follow(goal) => {
+                let (goal, running) = goal.accept();
+                let trajectory = follow_trajectory(&goal, arm, names);
+                self.carry_out(Active::Follow(running), trajectory, false)
+            }
+            Command::Until(goal) => {
+                let (goal, running) = goal.accept();
+                let trajectory = until_trajectory(&goal, arm, names);
+                self.carry_out(Active::Until(running), trajectory, true)
+            }
+            Command::SetIo(request, reply) => {
+                self.set_io(&request, reply);
+                Ok(())
+            }
+        }
+    }
+
+    /// What can be obeyed while a goal is active.
+    fn obey_meanwhile(&mut self, command: Command) {
+        let reason = "another goal is active";
+        match command {
+            Command::Follow(goal) => goal.reject(reason),
+            Command::Until(goal) => goal.reject(reason),
+            Command::SetIo(request, reply) => self.set_io(&request, reply),
+        }
+    }
+
+    fn set_io(&mut self, request: &SetIORequest, reply: oneshot::Sender<bool>) {
+        let done = self.workcell.set_io(request);
+        if let Err(reason) = &done {
+            warn!("set_io: {reason}");
+        }
+        // The new state is out before the reply is.
+        self.say_pins_if_changed();
+        // The caller may have gone.
+        let _ = reply.send(done.is_ok());
+    }
+
+    /// Carries a goal out to its end.
+    fn carry_out(
+        &mut self,
+        goal: Active,
+        trajectory: Result<JointTrajectory, Failure>,
+        until_contact: bool,
+    ) -> anyhow::Result<()> {
+        let begun =
+            trajectory.and_then(|trajectory| self.workcell.begin(trajectory, until_contact));
+        if let Err(failure) = begun {
+            warn!("goal aborted: {failure}");
+            goal.end(End::Failed(failure));
+            return Ok(());
+        }
+        self.frames.clear();
+        let end = self.drive(&goal)?;
+        match &end {
+            End::Failed(failure) => error!("goal aborted: {failure}"),
+            End::Motion(MotionEnd::Lag) => warn!("goal aborted: the suction tip lags behind"),
+            End::Motion(_) => {}
+            End::Cancelled => info!("goal cancelled, the arm stands still"),
+        }
+        // Whoever hears of the end can know where it led to.
+        self.say_pins_if_changed();
+        self.say_status()?;
+        if let Some(assessment) = self.workcell.assess() {
+            self.reward.publish(Reward {
+                header: self.header()?,
+                delta: assessment.delta_reward,
+                total: assessment.total_reward,
+                complete: assessment.complete,
+            });
+        }
+        goal.end(end);
+        if self.workcell.is_at_rest() {
+            self.look()?;
+        }
+        Ok(())
+    }
+
+    /// Steps the physics to the goal's end.
+    fn drive(&mut self, goal: &Active) -> anyhow::Result<End> {
+        let begin = (Instant::now(), self.workcell.time());
+        let rate_hz = self.parameters.joint_states_rate_hz;
+        let tick_of = |time: Duration, rate_hz: f64| (time.as_secs_f64() * rate_hz) as u64;
+        let mut said = tick_of(begin.1, rate_hz);
+        let mut next_feedback = begin.1 + FEEDBACK_PERIOD;
+        loop {
+            while let Ok(command) = self.commands.try_recv() {
+                self.obey_meanwhile(command);
+            }
+            if goal.is_cancel_requested() || self.stop.load(Ordering::Acquire) {
+                self.workcell.cancel();
+                return Ok(End::Cancelled);
+            }
+            match self.workcell.step() {
+                Step::Moving => {}
+                Step::Ended(end) => return Ok(End::Motion(end)),
+                Step::Failed(reason) => {
+                    self.workcell.cancel();
+                    let code = FollowJointTrajectoryResult::INVALID_GOAL;
+                    return Ok(End::Failed(Failure::new(code, reason)));
+                }
+            }
+            let time = self.workcell.time();
+            let tick = tick_of(time, rate_hz);
+            if tick != said {
+                said = tick;
+                self.say_status()?;
+            }
+            if time >= next_feedback {
+                next_feedback += FEEDBACK_PERIOD;
+                self.say_feedback(goal, time - begin.1)?;
+            }
+            if Instant::now() >= self.next_status {
+                self.say_pins();
+                self.next_status = self.after(self.parameters.status_period_s);
+            }
+            self.pace(begin);
+        }
+    }
+
+    /// Waits where simulated time is to run no faster than a multiple of the wall clock's.
+    fn pace(&self, begin: (Instant, Duration)) {
+        let factor = self.parameters.real_time_factor;
+        if factor > 0.0 {
+            let due = (self.workcell.time() - begin.1).div_f64(factor);
+            thread::sleep(due.saturating_sub(begin.0.elapsed()));
+        }
+    }
+
+    /// Renders the cameras' frames, and says them.
+    fn look(&mut self) -> anyhow::Result<()> {
+        let time = self.workcell.time();
+        let settled = self.workcell.environment().cell().is_settled();
+        if !settled {
+            warn!("the bodies have not come to rest; the frames show them in motion");
+        }
+        let cell = self.workcell.environment_mut().cell_mut();
+        let cameras = cell.cameras().to_vec();
+        let images = cell.render()?;
+        self.frames = cameras
+            .iter()
+            .zip(images)
+            .map(|(camera, image)| Frame::new(camera, image, time))
+            .collect::<Result<_, _>>()?;
+        self.say_frames();
+        let environment = self.workcell.environment();
+        let level = if settled { Level::Ok } else { Level::Warn };
+        let values = [
+            ("simulated_time_s", format!("{:.9}", time.as_secs_f64())),
+            ("state_hash", format!("{:016x}", environment.state_hash())),
+            ("steps", environment.steps().to_string()),
+            ("total_reward", environment.total_reward().to_string()),
+        ];
+        let said = if settled { "at rest" } else { "not at rest" };
+        self.node
+            .diagnostics()
+            .set("simulation", level, said, values);
+        info!(
+            "{said} at {time:?}: state {:016x}",
+            environment.state_hash()
+        );
+        Ok(())
+    }
+
+    fn header(&self) -> anyhow::Result<Header> {
+        let time = self.workcell.time();
+        Ok(convert::header(time, &self.parameters.world_frame)?)
+    }
+
+    fn say_status(&mut self) -> anyhow::Result<()> {
+        let header = self.header()?;
+        self.clock.publish(Clock {
+            clock: header.stamp.clone(),
+        });
+        self.joint_states.publish(convert::joint_state_to_msg(
+            header,
+            &self.work_cell.joint_names,
+            &self.workcell.joints_rad(),
+            &self.workcell.velocities_rad_s(),
+        ));
+        self.next_status = self.after(self.parameters.status_period_s);
+        Ok(())
+    }
+
+    fn say_pins(&mut self) {
+        self.said_pins = self.workcell.io_states();
+        self.io_states.publish(self.said_pins.clone());
+    }
+
+    fn say_pins_if_changed(&mut self) {
+        if self.workcell.io_states() != self.said_pins {
+            self.say_pins();
+        }
+    }
+
+    fn say_feedback(&self, goal: &Active, elapsed: Duration) -> anyhow::Result<()> {
+        let point = JointTrajectoryPoint {
+            positions: self.workcell.joints_rad().iter().copied().collect(),
+            velocities: self.workcell.velocities_rad_s().iter().copied().collect(),
+            time_from_start: convert::duration_to_msg(elapsed)?,
+            ..Default::default()
+        };
+        goal.feedback(self.header()?, self.work_cell.joint_names.to_vec(), point);
+        Ok(())
+    }
+
+    fn say_frames(&mut self) {
+        for (camera, frame) in self.cameras.iter().zip(&self.frames) {
+            camera.publish(frame.clone());
+        }
+        self.next_frames = self.after(self.parameters.frames_period_s);
+    }
+
+    fn after(&self, period_s: f64) -> Instant {
+        Instant::now() + Duration::from_secs_f64(period_s)
+    }
+}

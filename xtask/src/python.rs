@@ -9,6 +9,9 @@ use std::process::Command;
 /// Oldest and newest CPython 3 for which there are ROS 2 wheels.
 const ROS_MINORS: std::ops::RangeInclusive<u32> = 10..=13;
 
+/// ROS packages for the tests: ours, and what is needed beside it that has no wheel.
+const MESSAGE_PACKAGES: [&str; 2] = ["msgs", "tests/tf2_msgs"];
+
 /// The machine's `python3`, checked to be 3.9 or newer and to have pip.
 pub fn with_pip() -> Result<PathBuf> {
     let python = PathBuf::from("python3");
@@ -118,49 +121,64 @@ impl Environment {
         fs::write(&stamp, recipe).with_context(|| format!("cannot write {}", stamp.display()))
     }
 
-    /// Builds the ROS package in `msgs/` and installs it into the environment.
+    /// Builds our ROS packages and installs them into the environment.
     fn build_messages(&self, root: &Path) -> Result<()> {
         let stamp = self.prefix.join("messages-made-from.txt");
-        let recipe = message_sources(&root.join("msgs"))?;
+        let mut recipe = String::new();
+        for package in MESSAGE_PACKAGES {
+            recipe += &message_sources(&root.join(package))?;
+        }
         if fs::read_to_string(&stamp).is_ok_and(|text| text == recipe) {
-            println!("python: sctn_msgs present in {}", self.prefix.display());
+            println!("python: messages present in {}", self.prefix.display());
             return Ok(());
         }
-        println!("python: building sctn_msgs ...");
-        let build = self.prefix.join("build/sctn_msgs");
+        for package in MESSAGE_PACKAGES {
+            println!("python: building the messages of {package} ...");
+            self.build_package(
+                &root.join(package),
+                &self.prefix.join("build").join(package),
+            )
+            .with_context(|| {
+                format!("cannot build the ROS package {package} (a C++ compiler is needed)")
+            })?;
+        }
+        fs::write(&stamp, recipe).with_context(|| format!("cannot write {}", stamp.display()))
+    }
+
+    fn build_package(&self, source: &Path, build: &Path) -> Result<()> {
         if build.exists() {
-            fs::remove_dir_all(&build)
+            fs::remove_dir_all(build)
                 .with_context(|| format!("cannot remove {}", build.display()))?;
         }
-        let cmake = |arguments: &[&str]| -> Result<String> {
-            // Through Python, so that the environment's CMake runs and no other.
-            output(
-                self.python()?
-                    .args(["-c", "import cmake; cmake.cmake()"])
-                    .args(arguments),
-            )
+        // Through Python, so that the environment's CMake runs and no other.
+        let cmake = || -> Result<Command> {
+            let mut command = self.python()?;
+            command.args(["-c", "import cmake; cmake.cmake()"]);
+            Ok(command)
         };
-        let (source, build) = (
-            root.join("msgs").display().to_string(),
-            build.display().to_string(),
-        );
         let prefix = format!("-DCMAKE_INSTALL_PREFIX={}", self.prefix.display());
-        let settings = [
-            "-DBUILD_TESTING=OFF",
-            "-DCMAKE_BUILD_TYPE=Release",
-            "-DPython3_FIND_VIRTUALENV=ONLY",
-        ];
-        let rpath = "-DCMAKE_INSTALL_RPATH=$ORIGIN";
-        cmake(
-            &[
-                &["-S", &source, "-B", &build, "-G", "Ninja", &prefix, rpath],
-                &settings[..],
-            ]
-            .concat(),
+        output(
+            cmake()?
+                .arg("-S")
+                .arg(source)
+                .arg("-B")
+                .arg(build)
+                .args([
+                    "-G",
+                    "Ninja",
+                    &prefix,
+                    "-DCMAKE_INSTALL_RPATH=$ORIGIN",
+                    "-DCMAKE_BUILD_TYPE=Release",
+                ])
+                .args(["-DBUILD_TESTING=OFF", "-DPython3_FIND_VIRTUALENV=ONLY"]),
+        )?;
+        output(
+            cmake()?
+                .arg("--build")
+                .arg(build)
+                .args(["--target", "install"]),
         )
-        .and_then(|_| cmake(&["--build", &build, "--target", "install"]))
-        .context("cannot build the ROS package msgs/ (a C++ compiler is needed)")?;
-        fs::write(&stamp, recipe).with_context(|| format!("cannot write {}", stamp.display()))
+        .map(drop)
     }
 }
 

@@ -1,0 +1,143 @@
+"""A driver of three RGB-D cameras, written with rclpy: a flat table with one box, seen from straight above."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from builtin_interfaces.msg import Time
+from geometry_msgs.msg import Quaternion, Transform, TransformStamped, Vector3
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from sensor_msgs.msg import CameraInfo, Image
+from std_msgs.msg import Header
+from tf2_msgs.msg import TFMessage
+
+from cell_operator import LATCHED, Operator
+
+NAMES = ("front", "left", "right")
+WIDTH, HEIGHT, FOCAL_PX = 640, 480, 450.0
+
+CAMERA_HEIGHT_M = 1.0
+BOX_HEIGHT_M = 0.05
+BOX_COLOUR = (200, 30, 30)
+# Rows and columns of the image that show the box: the middle, which is the point (0.5, 0) of the world.
+BOX = np.s_[220:260, 300:340]
+
+IMAGES = QoSProfile(depth=5, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.VOLATILE)
+
+
+@dataclass
+class View:
+    """What one camera says at one time."""
+
+    colour: Image
+    depth: Image
+    info: CameraInfo
+
+
+Change = Callable[[View], None]
+
+
+class Cameras:
+    """Publishes views of all three cameras, each time with a later stamp."""
+
+    def __init__(self, operator: Operator, names: tuple[str, ...] = NAMES) -> None:
+        self._operator = operator
+        self._seconds = 100
+        node = operator.node
+        self._publishers = {
+            name: (
+                node.create_publisher(Image, f"{name}/color/image_raw", IMAGES),
+                node.create_publisher(Image, f"{name}/depth/image_rect_raw", IMAGES),
+                node.create_publisher(CameraInfo, f"{name}/color/camera_info", IMAGES),
+            )
+            for name in names
+        }
+        self._transforms = node.create_publisher(TFMessage, "/tf_static", LATCHED)
+
+    def wait_for_fusion(self) -> None:
+        """Waits until somebody listens to every topic."""
+        publishers = [publisher for group in self._publishers.values() for publisher in group]
+        self._operator.until(
+            lambda: all(publisher.get_subscription_count() for publisher in [*publishers, self._transforms]),
+            "node that listens to the cameras",
+            30.0,
+        )
+
+    def publish_extrinsics(self, names: tuple[str, ...] = NAMES) -> None:
+        """Says where the cameras stand: over the middle of the workspace, looking down."""
+        # Half a turn about x + y: the image's right is the world's +y, its down the world's +x.
+        downwards = Quaternion(x=np.sqrt(0.5), y=np.sqrt(0.5), z=0.0, w=0.0)
+        self._transforms.publish(
+            TFMessage(
+                transforms=[
+                    TransformStamped(
+                        header=Header(frame_id="world"),
+                        child_frame_id=optical_frame(name),
+                        transform=Transform(translation=Vector3(x=0.5, y=0.0, z=CAMERA_HEIGHT_M), rotation=downwards),
+                    )
+                    for name in names
+                ]
+            )
+        )
+
+    def publish(self, change: Change = lambda _: None, changed: str = "left", leave_out: str | None = None) -> Time:
+        """Publishes one view of each camera and returns their stamp. `change` alters the view of the camera `changed`."""
+        self._seconds += 1
+        stamp = Time(sec=self._seconds)
+        for name, (colour, depth, info) in self._publishers.items():
+            if name == leave_out:
+                continue
+            view = good_view(Header(stamp=stamp, frame_id=optical_frame(name)))
+            if name == changed:
+                change(view)
+            info.publish(view.info)
+            depth.publish(view.depth)
+            colour.publish(view.colour)
+        return stamp
+
+
+def optical_frame(name: str) -> str:
+    """The frame of a camera's images."""
+    return f"{name}_color_optical_frame"
+
+
+def good_view(header: Header) -> View:
+    """The table with the box."""
+    colour = np.full((HEIGHT, WIDTH, 3), 120, dtype=np.uint8)
+    colour[BOX] = BOX_COLOUR
+    depth = np.full((HEIGHT, WIDTH), CAMERA_HEIGHT_M, dtype=np.float32)
+    depth[BOX] = CAMERA_HEIGHT_M - BOX_HEIGHT_M
+    centre_x, centre_y = (WIDTH - 1) / 2, (HEIGHT - 1) / 2
+    return View(
+        colour=image(header, "rgb8", 3 * WIDTH, colour),
+        depth=image(header, "32FC1", 4 * WIDTH, depth),
+        info=CameraInfo(
+            header=header,
+            width=WIDTH,
+            height=HEIGHT,
+            distortion_model="plumb_bob",
+            d=[0.0] * 5,
+            k=[FOCAL_PX, 0.0, centre_x, 0.0, FOCAL_PX, centre_y, 0.0, 0.0, 1.0],
+            r=[1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0],
+            p=[FOCAL_PX, 0.0, centre_x, 0.0, 0.0, FOCAL_PX, centre_y, 0.0, 0.0, 0.0, 1.0, 0.0],
+        ),
+    )
+
+
+def image(header: Header, encoding: str, step: int, pixels: np.ndarray) -> Image:
+    """An image message of little-endian pixels."""
+    message = Image(header=header, width=WIDTH, height=HEIGHT, encoding=encoding, step=step, is_bigendian=0)
+    message.data.frombytes(pixels.tobytes())
+    return message
+
+
+def depth_pixels(view: View) -> np.ndarray:
+    """A copy of the depth image [m]."""
+    return np.frombuffer(view.depth.data.tobytes(), dtype=np.float32).reshape(HEIGHT, WIDTH).copy()
+
+
+def set_depth(view: View, pixels: np.ndarray) -> None:
+    """Replaces the depth image, in its own encoding."""
+    view.depth = image(view.depth.header, view.depth.encoding, pixels.itemsize * WIDTH, pixels)

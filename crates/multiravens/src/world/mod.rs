@@ -13,9 +13,10 @@ pub use ur5::Shape;
 use convert::{from_point, from_pose, from_vector, to_pose};
 use nalgebra::{Isometry3, Point3, Unit, Vector3};
 use rapier3d::prelude::{
-    ColliderBuilder, ColliderHandle, PhysicsWorld, RigidBodyBuilder, RigidBodyHandle,
-    SpringCoefficients, Vector,
+    ColliderBuilder, ColliderHandle, PhysicsWorld, Pose, RigidBodyBuilder, RigidBodyHandle,
+    Rotation, SharedShape, SpringCoefficients, Vector,
 };
+use std::f32::consts::FRAC_PI_2;
 use std::time::Duration;
 use suction::Suction;
 
@@ -124,21 +125,9 @@ impl World {
     }
 
     fn insert(&mut self, part: &Part, builder: RigidBodyBuilder, suction_force_n: f32) -> BodyId {
-        let collider = match part.shape {
-            Shape::Sphere { radius_m } => ColliderBuilder::ball(radius_m as f32),
-            Shape::Cylinder { radius_m, length_m } => {
-                // The engine's cylinders stand along y.
-                ColliderBuilder::cylinder(length_m as f32 / 2.0, radius_m as f32)
-                    .rotation(Vector::new(std::f32::consts::FRAC_PI_2, 0.0, 0.0))
-            }
-            Shape::Cuboid { size_m } => {
-                let half = size_m / 2.0;
-                ColliderBuilder::cuboid(half.x as f32, half.y as f32, half.z as f32)
-            }
-        };
         let collider = match part.mobility {
-            Mobility::Fixed => collider,
-            Mobility::Free { mass_kg, .. } => collider.mass(mass_kg as f32),
+            Mobility::Fixed => collider(&part.shape, false),
+            Mobility::Free { mass_kg, .. } => collider(&part.shape, true).mass(mass_kg as f32),
         };
         let (handle, collider) = self.physics.insert(
             builder.pose(to_pose(&part.pose)),
@@ -249,6 +238,41 @@ impl World {
         let points = pair.manifolds().iter().flat_map(|m| &m.points);
         points.map(|point| point.dist).reduce(f32::min)
     }
+}
+
+fn collider(shape: &Shape, free: bool) -> ColliderBuilder {
+    match *shape {
+        Shape::Sphere { radius_m } => ColliderBuilder::ball(radius_m as f32),
+        Shape::Cylinder { radius_m, length_m } if free => {
+            disk(radius_m as f32, length_m as f32 / 2.0)
+        }
+        Shape::Cylinder { radius_m, length_m } => {
+            // The engine's cylinders stand along y.
+            ColliderBuilder::cylinder(length_m as f32 / 2.0, radius_m as f32)
+                .rotation(Vector::new(FRAC_PI_2, 0.0, 0.0))
+        }
+        Shape::Cuboid { size_m } => {
+            let half = size_m / 2.0;
+            ColliderBuilder::cuboid(half.x as f32, half.y as f32, half.z as f32)
+        }
+    }
+}
+
+/// A cylinder as a regular prism of twelve sides, made of six boxes. The engine's own cylinder
+/// never rests when it leans on something: its contacts jump between features.
+fn disk(radius: f32, half_height: f32) -> ColliderBuilder {
+    const BOXES: usize = 6;
+    let step = std::f32::consts::PI / BOXES as f32;
+    let (half_width, half_length) = (step / 2.0).sin_cos();
+    let shape = SharedShape::cuboid(radius * half_length, radius * half_width, half_height);
+    let boxes = (0..BOXES).map(|index| {
+        let turn = Vector::new(0.0, 0.0, index as f32 * step);
+        (
+            Pose::from_rotation(Rotation::from_scaled_axis(turn)),
+            shape.clone(),
+        )
+    });
+    ColliderBuilder::compound(boxes.collect())
 }
 
 /// Duration of a number of physics steps.

@@ -12,8 +12,9 @@ use rapier3d::prelude::{
     PhysicsWorld, RigidBodyBuilder, RigidBodyHandle, Vector,
 };
 
-const TIP_RADIUS_M: f32 = 0.005;
-const TIP_HEIGHT_M: f32 = 0.01;
+/// Half of the width and of the height of the cup, a box because the engine's contacts of boxes
+/// are the steadiest.
+const TIP_HALF_M: (f32, f32) = (0.004, 0.005);
 const TIP_MASS_KG: f32 = 0.1;
 const TIP_INERTIA_KG_M2: f32 = 1e-4;
 const STIFFNESS_N_M: f32 = 3158.0;
@@ -49,9 +50,9 @@ impl Suction {
             // A moving kinematic body does not wake what is joined to it.
             .can_sleep(false);
         // The cup reaches from the tip's frame back into the tool.
-        let cup = ColliderBuilder::cylinder(TIP_HEIGHT_M / 2.0, TIP_RADIUS_M)
-            .rotation(Vector::new(std::f32::consts::FRAC_PI_2, 0.0, 0.0))
-            .translation(Vector::new(0.0, 0.0, -TIP_HEIGHT_M / 2.0))
+        let (half_width, half_height) = TIP_HALF_M;
+        let cup = ColliderBuilder::cuboid(half_width, half_width, half_height)
+            .translation(Vector::new(0.0, 0.0, -half_height))
             .density(0.0)
             .friction(0.5);
         let (tip, tip_collider) = physics.insert(body, cup);

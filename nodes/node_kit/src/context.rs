@@ -1,4 +1,4 @@
-//! One DDS participant, and the nodes that share it.
+//! Where nodes live: the network they look for others on, and their common end.
 
 use std::{
     env,
@@ -101,35 +101,25 @@ impl Network {
     }
 }
 
-/// One DDS participant. Nodes of one process share it, as discovery probes only a dozen
-/// participants per host.
+/// What the nodes of a process have in common.
+///
+/// Each node has a DDS participant of its own, in one process as in several: a RustDDS participant
+/// that may use loopback only does not hear itself, nodes of one participant take discovery events
+/// from each other, and one event loop would carry all images. Without multicast discovery finds a
+/// dozen participants per host.
 #[derive(Clone)]
 pub struct Context {
-    ros: ros2_client::Context,
+    network: Network,
     shutdown: CancellationToken,
 }
 
 impl Context {
-    /// Joins a domain.
-    pub fn new(network: Network) -> Result<Self, ContextError> {
-        let Network {
-            domain_id,
-            localhost_only,
-        } = network;
-        let middleware = |reason: String| ContextError::Middleware { domain_id, reason };
-        let mut builder = DomainParticipantBuilder::new(domain_id);
-        if localhost_only {
-            builder = builder.with_only_networks([IpAddr::V4(Ipv4Addr::LOCALHOST)]);
-        }
-        let participant = builder
-            .build()
-            .map_err(|error| middleware(format!("{error:?}")))?;
-        let ros = ros2_client::Context::from_domain_participant(participant)
-            .map_err(|error| middleware(error.to_string()))?;
-        Ok(Self {
-            ros,
+    /// Nodes made from this will live on that network.
+    pub fn new(network: Network) -> Self {
+        Self {
+            network,
             shutdown: CancellationToken::new(),
-        })
+        }
     }
 
     /// Makes a node and reads its parameters.
@@ -143,7 +133,8 @@ impl Context {
         let full_name = format!("/{namespace}/{name}").replace("//", "/");
         let loaded = parameters::load::<P>(&arguments.parameters, default_name, &full_name)?;
         let node = Node::new(
-            self,
+            self.network.join()?,
+            self.shutdown.child_token(),
             default_name,
             arguments,
             loaded.use_sim_time,
@@ -178,12 +169,26 @@ impl Context {
 
     /// Ends all nodes of this context.
     pub fn shutdown(&self) {
-        logging::shutting_down();
         self.shutdown.cancel();
     }
+}
 
-    pub(crate) fn ros(&self) -> &ros2_client::Context {
-        &self.ros
+impl Network {
+    /// A new participant of the domain.
+    fn join(self) -> Result<ros2_client::Context, ContextError> {
+        let middleware = |reason: String| ContextError::Middleware {
+            domain_id: self.domain_id,
+            reason,
+        };
+        let mut builder = DomainParticipantBuilder::new(self.domain_id);
+        if self.localhost_only {
+            builder = builder.with_only_networks([IpAddr::V4(Ipv4Addr::LOCALHOST)]);
+        }
+        let participant = builder
+            .build()
+            .map_err(|error| middleware(format!("{error:?}")))?;
+        ros2_client::Context::from_domain_participant(participant)
+            .map_err(|error| middleware(error.to_string()))
     }
 }
 
@@ -261,7 +266,7 @@ where
         .build()
         .context("tokio runtime")?;
     let result = runtime.block_on(async {
-        let context = Context::new(network)?;
+        let context = Context::new(network);
         let ended = context.start(default_name, &arguments, run)?;
         let signalled = tokio::spawn({
             let context = context.clone();

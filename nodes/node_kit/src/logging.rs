@@ -3,23 +3,18 @@
 use std::{
     collections::BTreeMap,
     fmt::{Debug, Write},
-    io,
-    sync::{
-        Arc, PoisonError, RwLock,
-        atomic::{AtomicBool, Ordering},
-    },
+    io::{self, IsTerminal},
+    sync::{Arc, PoisonError, RwLock},
 };
 
 use ros2_client::Log;
 use tracing::{
-    Event, Level, Metadata, Subscriber,
+    Event, Level, Subscriber,
     field::{Field, Visit},
     span::{Attributes, Id},
 };
 use tracing_subscriber::{
-    EnvFilter, Layer,
-    filter::filter_fn,
-    fmt,
+    EnvFilter, Layer, fmt,
     layer::{Context, SubscriberExt},
     registry::LookupSpan,
     util::SubscriberInitExt,
@@ -30,11 +25,9 @@ use crate::clock::Clock;
 /// The span of each node, with its full name as field `node`.
 const SPAN: &str = "node";
 
-/// Logs say who spoke; the middleware's own are errors and warnings only.
-const DEFAULT_FILTER: &str = "info,rustdds=error,ros2_client=error";
-
-/// Set when the process ends on purpose: the middleware then logs errors that are none.
-static SHUTTING_DOWN: AtomicBool = AtomicBool::new(false);
+/// RustDDS logs an error for every endpoint of a node that ends, which is none; what fails for
+/// good comes back to us as an error anyway. RUST_LOG=rustdds=warn shows all.
+const DEFAULT_FILTER: &str = "info,rustdds=off,ros2_client=error";
 
 /// What writes to `/rosout` for each node of this process.
 static WRITERS: RwLock<BTreeMap<String, RosoutWriter>> = RwLock::new(BTreeMap::new());
@@ -70,13 +63,10 @@ pub fn init(levels: &[String]) -> Result<(), LogLevelError> {
         })?;
         filter = filter.add_directive(directive);
     }
-    let quiet_end = filter_fn(|metadata: &Metadata<'_>| {
-        !(SHUTTING_DOWN.load(Ordering::Relaxed) && is_middleware(metadata.target()))
-    });
     let stderr = fmt::layer()
         .with_writer(io::stderr)
-        .with_target(false)
-        .with_filter(quiet_end);
+        .with_ansi(io::stderr().is_terminal())
+        .with_target(false);
     // A second call finds a subscriber in place and leaves it there.
     let _ = tracing_subscriber::registry()
         .with(filter)
@@ -84,10 +74,6 @@ pub fn init(levels: &[String]) -> Result<(), LogLevelError> {
         .with(Rosout)
         .try_init();
     Ok(())
-}
-
-pub(crate) fn shutting_down() {
-    SHUTTING_DOWN.store(true, Ordering::Relaxed);
 }
 
 fn is_middleware(target: &str) -> bool {

@@ -25,7 +25,6 @@ use crate::{
     action::{ActionClient, ActionServer},
     arguments::RosArguments,
     clock::Clock,
-    context::Context,
     diagnostics::{self, Diagnostics},
     graph::Graph,
     logging,
@@ -78,7 +77,7 @@ pub struct Node {
 
 struct Inner {
     ros: Mutex<ros2_client::Node>,
-    context: Context,
+    context: ros2_client::Context,
     arguments: RosArguments,
     /// Name before remapping, which remap rules and `-p` rules refer to.
     default_name: String,
@@ -101,7 +100,8 @@ impl Drop for Inner {
 
 impl Node {
     pub(crate) fn new(
-        context: &Context,
+        context: ros2_client::Context,
+        shutdown: CancellationToken,
         default_name: &str,
         arguments: &RosArguments,
         use_sim_time: bool,
@@ -117,7 +117,6 @@ impl Node {
         })?;
         let full_name = node_name.fully_qualified_name();
         let mut ros = context
-            .ros()
             .new_node(node_name, options(declared))
             .map_err(|error| NodeError::middleware("node", &full_name, error))?;
         let spinner = ros
@@ -129,7 +128,7 @@ impl Node {
         let node = Self {
             inner: Arc::new(Inner {
                 ros: Mutex::new(ros),
-                context: context.clone(),
+                context,
                 arguments: arguments.clone(),
                 default_name: default_name.to_owned(),
                 name: name.to_owned(),
@@ -139,7 +138,7 @@ impl Node {
                 statistics: Mutex::default(),
                 diagnostics: Diagnostics::default(),
                 span,
-                shutdown: context.shutdown_token().child_token(),
+                shutdown,
                 shutdown_observed: AtomicBool::new(false),
             }),
         };
@@ -180,7 +179,7 @@ impl Node {
 
     /// What discovery knows.
     pub fn graph(&self) -> Graph {
-        Graph::new(self.inner.context.ros().domain_participant())
+        Graph::new(self.inner.context.domain_participant())
     }
 
     /// Waits until the process is told to end. A node that waits for it gets two seconds to tidy
@@ -389,7 +388,6 @@ impl Node {
         let topic = self
             .inner
             .context
-            .ros()
             .domain_participant()
             .create_topic(
                 format!("rt{full}"),

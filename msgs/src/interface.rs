@@ -56,7 +56,7 @@ pub trait Action {
 pub fn message_type_name<T: Interface>() -> MessageTypeName {
     let mut parts = T::TYPE_NAME.split('/');
     let package = parts.next().unwrap_or_default();
-    MessageTypeName::new(package, parts.last().unwrap_or_default())
+    MessageTypeName::new(package, parts.next_back().unwrap_or_default())
 }
 
 /// Sees each type once: [`visit_all`](crate::visit_all).

@@ -1,4 +1,4 @@
-//! UR5 kinematics, trajectories and the work cell read from its URDF.
+#![doc = include_str!("../README.md")]
 
 mod arm;
 mod trajectory;

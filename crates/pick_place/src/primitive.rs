@@ -138,6 +138,8 @@ pub enum PrimitiveError {
 const LOWEST_M: f64 = -0.01;
 /// The arm must be able to rise to this height over a pose to work there.
 const LEAST_RISE_M: f64 = 0.05;
+/// The arm counts as home within this distance of each joint.
+const AT_HOME_RAD: f64 = 1e-2;
 /// The arm keeps this far below its highest point over a pose, where it would be stretched out.
 const STRETCH_MARGIN_M: f64 = 0.005;
 
@@ -349,16 +351,10 @@ impl<'a> Primitive<'a> {
         self.joint_space(&self.arm.home)
     }
 
-    /// Straight up to the clearance, or as far as the arm reaches; none when it is there.
     fn rise(&self) -> Result<Option<Command>, PrimitiveError> {
-        let tip = self.arm.tip(&self.joints);
-        let Some(height_m) = rise_to_m(self.arm, &tip, self.settings.clearance_m, &self.joints)
-        else {
-            return Ok(None);
-        };
-        let mut to = tip;
-        to.translation.z = height_m;
-        self.line(&to, self.settings.travel_m_s).map(Some)
+        plan_rise(self.arm, &self.settings, &self.joints)
+            .map(|rise| rise.map(Command::Follow))
+            .map_err(|reason| self.plan_error(reason))
     }
 
     fn line(&self, to: &Isometry3<f64>, speed_m_s: f64) -> Result<Command, PrimitiveError> {
@@ -425,11 +421,22 @@ fn highest_m(arm: &Arm, tip: &Isometry3<f64>, wanted_m: f64, near: &Joints) -> f
     low - STRETCH_MARGIN_M
 }
 
-/// The height to rise to before anything else, if the tip is lower than it could and should be.
-fn rise_to_m(arm: &Arm, tip: &Isometry3<f64>, clearance_m: f64, joints: &Joints) -> Option<f64> {
-    if tip.translation.z >= clearance_m {
-        return None;
+/// Straight up to the clearance, or as far as the arm reaches; none when the tip is that high or
+/// the arm at home.
+pub(crate) fn plan_rise(
+    arm: &Arm,
+    settings: &PrimitiveSettings,
+    joints: &Joints,
+) -> Result<Option<JointTrajectory>, PlanError> {
+    let mut tip = arm.tip(joints);
+    let height_m = tip.translation.z;
+    if height_m >= settings.clearance_m || (joints - arm.home).amax() < AT_HOME_RAD {
+        return Ok(None);
     }
-    let height_m = highest_m(arm, tip, clearance_m, joints);
-    (height_m > tip.translation.z).then_some(height_m)
+    tip.translation.z = highest_m(arm, &tip, settings.clearance_m, joints);
+    if tip.translation.z <= height_m {
+        return Ok(None);
+    }
+    let (speed, acceleration) = (settings.travel_m_s, settings.acceleration_m_s2);
+    JointTrajectory::line(arm, joints, &tip, speed, acceleration).map(Some)
 }

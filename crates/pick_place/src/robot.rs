@@ -1,6 +1,6 @@
 //! The robot as the primitive sees it.
 
-use crate::primitive::{Command, Next, Primitive};
+use crate::primitive::{Command, Next, Primitive, plan_rise};
 use crate::{Outcome, Phase, PickPlace, PrimitiveError, PrimitiveSettings, Report};
 use ur5::{Arm, JointTrajectory, Joints};
 
@@ -67,6 +67,36 @@ pub fn execute<R: Robot>(
             observe(phase);
         }
     }
+}
+
+/// Takes the arm home from wherever it stands, straight up first, and leaves suction as it is: the
+/// way back after a fault, once a person has allowed it.
+///
+/// # Errors
+/// Returns at once, without another command to the robot.
+pub fn go_home<R: Robot>(
+    robot: &mut R,
+    arm: &Arm,
+    settings: &PrimitiveSettings,
+) -> Result<(), ExecuteError<R::Error>> {
+    settings.check().map_err(PrimitiveError::from)?;
+    let plan_error = |phase| move |reason| PrimitiveError::Plan { phase, reason };
+    let robot_error = |phase| move |error| ExecuteError::Robot { phase, error };
+    let phase = Phase::Retreat;
+    let joints = robot.joints().map_err(robot_error(phase))?;
+    if let Some(rise) = plan_rise(arm, settings, &joints).map_err(plan_error(phase))?
+        && !robot.follow(&rise).map_err(robot_error(phase))?
+    {
+        return Err(PrimitiveError::Blocked { phase }.into());
+    }
+    let phase = Phase::Home;
+    let joints = robot.joints().map_err(robot_error(phase))?;
+    let way = JointTrajectory::joint_space_within(arm, &joints, &arm.home, settings.travel_m_s)
+        .map_err(plan_error(phase))?;
+    if !robot.follow(&way).map_err(robot_error(phase))? {
+        return Err(PrimitiveError::Blocked { phase }.into());
+    }
+    Ok(())
 }
 
 fn carry_out<R: Robot>(robot: &mut R, command: &Command) -> Result<Report, R::Error> {

@@ -2,7 +2,8 @@
 
 use nalgebra::{Isometry2, Vector2};
 use pick_place::{
-    ExecuteError, Outcome, Phase, PickPlace, PrimitiveError, PrimitiveSettings, Robot, execute,
+    ExecuteError, Outcome, Phase, PickPlace, Primitive, PrimitiveError, PrimitiveSettings, Report,
+    Robot, execute, go_home,
 };
 use ur5::{Arm, JointTrajectory, Joints, WorkCell};
 
@@ -29,6 +30,8 @@ struct ScriptedRobot {
     lags_at: Option<usize>,
     /// Commands from this one on fail.
     fails_at: Option<usize>,
+    /// A protective stop half-way through this motion.
+    stops_in: Option<usize>,
     dropped: bool,
     motions: usize,
     descents: usize,
@@ -49,6 +52,7 @@ impl ScriptedRobot {
             drops_at: None,
             lags_at: None,
             fails_at: None,
+            stops_in: None,
             dropped: false,
             motions: 0,
             descents: 0,
@@ -82,6 +86,14 @@ impl ScriptedRobot {
         self.motions += 1;
     }
 
+    fn protective_stop(&mut self, trajectory: &JointTrajectory) -> Result<(), String> {
+        if self.stops_in == Some(self.motions) {
+            self.joints = trajectory.sample(trajectory.duration() / 2);
+            return Err("protective stop".into());
+        }
+        Ok(())
+    }
+
     fn height_m(&self) -> f64 {
         self.arm.tip(&self.joints).translation.z
     }
@@ -110,6 +122,7 @@ impl Robot for ScriptedRobot {
 
     fn follow(&mut self, trajectory: &JointTrajectory) -> Result<bool, String> {
         self.command()?;
+        self.protective_stop(trajectory)?;
         let lags = self.lags_at == Some(self.motions);
         self.begin(trajectory);
         let duration = if lags {
@@ -126,6 +139,7 @@ impl Robot for ScriptedRobot {
 
     fn follow_until_contact(&mut self, trajectory: &JointTrajectory) -> Result<bool, String> {
         self.command()?;
+        self.protective_stop(trajectory)?;
         self.begin(trajectory);
         let contact_m = self.contacts_m[self.descents];
         self.descents += 1;
@@ -434,4 +448,53 @@ fn bad_actions_and_settings_are_refused_by_name_before_anything_moves() {
         );
     }
     assert_eq!(robot.calls, 0);
+}
+
+#[test]
+fn after_a_fault_the_arm_can_be_taken_home_with_what_it_holds() {
+    for motion in 0..7 {
+        let mut robot = ScriptedRobot::new();
+        robot.stops_in = Some(motion);
+        robot.run(&PrimitiveSettings::RIGID).0.unwrap_err();
+        robot.stops_in = None;
+        let (arm, suction, commands) = (robot.arm.clone(), robot.suction, robot.seen.len());
+        go_home(&mut robot, &arm, &PrimitiveSettings::RIGID).unwrap();
+        assert!(robot.is_home());
+        assert_eq!(robot.suction, suction);
+        let heights: Vec<_> = robot.seen[commands..].iter().collect();
+        assert!(
+            matches!(heights[..], [.., Seen::Follow { height_m }] if (height_m - 0.324).abs() < 1e-2),
+            "{heights:?}"
+        );
+    }
+}
+
+#[test]
+fn a_report_that_answers_another_command_is_refused() {
+    let arm = WorkCell::builtin().unwrap().arm;
+    let fresh = || Primitive::new(&arm, &action(), &PrimitiveSettings::RIGID, &arm.home).unwrap();
+    for report in [
+        Report::Contact(arm.home),
+        Report::NoContact(arm.home),
+        Report::SuctionSet,
+    ] {
+        let mut primitive = fresh();
+        primitive.next(Report::Holds(false)).unwrap();
+        let phase = primitive.phase();
+        let error = primitive.next(report).unwrap_err();
+        assert_eq!(error, PrimitiveError::UnexpectedReport { phase, report });
+    }
+    assert!(fresh().next(Report::SuctionSet).is_err());
+}
+
+#[test]
+fn the_highest_settings_still_work_in_the_middle_of_the_workspace() {
+    let mut robot = ScriptedRobot::new();
+    let highest = PrimitiveSettings {
+        clearance_m: 0.5,
+        lift_m: 0.5,
+        ..PrimitiveSettings::RIGID
+    };
+    assert_eq!(robot.run(&highest).0, Ok(Outcome::Placed));
+    assert!(robot.is_home());
 }

@@ -1,0 +1,166 @@
+//! Training recipes: everything that makes a policy, in one YAML file.
+
+use crate::sampling::{Sampling, SamplingError};
+use gctn::{NetworkConfig, TrainingConfig};
+use serde::{Deserialize, Serialize};
+use std::path::{Path, PathBuf};
+
+/// What to train on what, and how.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Recipe {
+    /// Problems whose demonstrations are learned from.
+    pub problems: Vec<String>,
+    /// Demonstrations of each problem.
+    pub demonstrations: usize,
+    /// The network.
+    pub network: NetworkConfig,
+    /// How it is trained.
+    pub training: TrainingConfig,
+    /// Which step is drawn how often.
+    #[serde(default)]
+    pub sampling: Sampling,
+    /// Number of snapshots, evenly spread over the training.
+    pub snapshots: u64,
+    /// How snapshots are compared.
+    pub validation: Validation,
+}
+
+/// Validation episodes, on seeds that neither training nor test uses.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Validation {
+    /// Episodes of each problem, of every snapshot; 0 keeps the last snapshot.
+    pub episodes: usize,
+    /// Seed of the first episode; odd, and below 10,000.
+    pub seed: u64,
+}
+
+/// A recipe that cannot be used.
+#[derive(Debug, thiserror::Error)]
+pub enum RecipeError {
+    /// The file cannot be read.
+    #[error("{}: {source}", path.display())]
+    Io {
+        /// The file.
+        path: PathBuf,
+        /// Why.
+        source: std::io::Error,
+    },
+    /// Not YAML, an unknown field, or a field of another type.
+    #[error("{}: {source}", path.display())]
+    Yaml {
+        /// The file.
+        path: PathBuf,
+        /// What the parser said, with line and column.
+        source: serde_yaml_ng::Error,
+    },
+    /// A network or training parameter out of range.
+    #[error("{}: {source}", path.display())]
+    Network {
+        /// The file.
+        path: PathBuf,
+        /// Which, and what was expected.
+        source: gctn::Error,
+    },
+    /// A weight out of range.
+    #[error("{}: {source}", path.display())]
+    Sampling {
+        /// The file.
+        path: PathBuf,
+        /// Which, and what was expected.
+        source: SamplingError,
+    },
+    /// A field out of range.
+    #[error("{}: {field} is {value}, expected {expected}", path.display())]
+    Field {
+        /// The file.
+        path: PathBuf,
+        /// Which.
+        field: &'static str,
+        /// Its value.
+        value: String,
+        /// What was expected.
+        expected: &'static str,
+    },
+}
+
+impl Recipe {
+    /// Reads and checks a recipe.
+    pub fn load(path: &Path) -> Result<Self, RecipeError> {
+        let owned = || path.to_owned();
+        let text = std::fs::read_to_string(path).map_err(|source| RecipeError::Io {
+            path: owned(),
+            source,
+        })?;
+        let recipe: Self = serde_yaml_ng::from_str(&text).map_err(|source| RecipeError::Yaml {
+            path: owned(),
+            source,
+        })?;
+        let network = |source| RecipeError::Network {
+            path: owned(),
+            source,
+        };
+        recipe.network.check().map_err(network)?;
+        recipe.training.check().map_err(network)?;
+        recipe
+            .sampling
+            .validate()
+            .map_err(|source| RecipeError::Sampling {
+                path: owned(),
+                source,
+            })?;
+        let field = |field, good: bool, value: String, expected| {
+            if good {
+                Ok(())
+            } else {
+                Err(RecipeError::Field {
+                    path: owned(),
+                    field,
+                    value,
+                    expected,
+                })
+            }
+        };
+        let Self {
+            problems,
+            demonstrations,
+            snapshots,
+            validation,
+            ..
+        } = &recipe;
+        field(
+            "problems",
+            !problems.is_empty(),
+            format!("{problems:?}"),
+            "at least one",
+        )?;
+        field(
+            "demonstrations",
+            *demonstrations > 0,
+            demonstrations.to_string(),
+            "at least 1",
+        )?;
+        let good = (1..=recipe.training.steps).contains(snapshots);
+        field(
+            "snapshots",
+            good,
+            snapshots.to_string(),
+            "1 to training.steps",
+        )?;
+        let good = validation.seed % 2 == 1 && validation.seed < 10_000;
+        field(
+            "validation.seed",
+            good,
+            validation.seed.to_string(),
+            "an odd number below 10,000",
+        )?;
+        Ok(recipe)
+    }
+
+    /// Steps after which a snapshot is taken, the last step among them.
+    pub fn snapshot_steps(&self) -> impl Iterator<Item = u64> {
+        let (steps, snapshots) = (self.training.steps, self.snapshots);
+        (1..=snapshots).map(move |index| index * steps / snapshots)
+    }
+}

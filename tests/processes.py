@@ -95,7 +95,7 @@ class Process:
 
     def log(self) -> str:
         """The ends of both, for a person to read."""
-        return f"...{self.output()[-1000:]}\n...{self.errors()[-4000:]}"
+        return f"{self.output()[-1000:]}\n{self.errors()[-4000:]}"
 
     def wait(self, timeout_s: float) -> int:
         """The exit code; an error with the end of the log when it is still running after the time."""

@@ -119,7 +119,7 @@ class Cell:
 @pytest.fixture(scope="module")
 def cell(start_for_module, operator_for_module: Operator) -> Cell:
     start_for_module("sim_workcell", "--ros-args", "-p", "problem:=placing", "-p", "seed:=10000")
-    start_for_module("suction_executor", "--ros-args", "--params-file", "config/suction_executor.yaml")
+    start_for_module("suction_executor", "--ros-args", "-p", "use_sim_time:=true")
     cell = Cell(operator_for_module)
     cell.wait_until_ready()
     return cell

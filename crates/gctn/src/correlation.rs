@@ -59,10 +59,22 @@ pub(crate) fn rotated_windows(
         .transpose(1, 2)
 }
 
-/// Correlates key features (N x C x H x W, margin included) with windows (N x R x C x k x k), by FFT.
+/// Correlates key features (N x C x H x W, margin included) with windows (N x R x C x k x k).
 /// Returns N x R x rows x cols: at p the sum over channels and offsets w of key(p + w) window(w), where
 /// p + w counts from the margin's corner.
 pub(crate) fn correlate(key: &Tensor, windows: &Tensor, grid: &Grid) -> Tensor {
+    // Where the transforms of many windows would cost most, only the columns are transformed: measured
+    // 9 ms against 50 ms for 36 windows of 8 x 25 x 25, but 31 ms against 6 ms for 4 samples of 2.
+    const MANY: i64 = 8;
+    if windows.size()[1] < MANY {
+        correlate_in_frequencies(key, windows, grid)
+    } else {
+        correlate_in_column_frequencies(key, windows, grid)
+    }
+}
+
+/// By FFT over rows and columns.
+fn correlate_in_frequencies(key: &Tensor, windows: &Tensor, grid: &Grid) -> Tensor {
     let size = key.size();
     // Circular wrap reaches only places that are cut off below.
     let fft_size = [size[2], size[3]].map(fast_size);
@@ -74,6 +86,32 @@ pub(crate) fn correlate(key: &Tensor, windows: &Tensor, grid: &Grid) -> Tensor {
         .fft_irfft2(fft_size.as_slice(), [-2, -1], "backward")
         .narrow(2, 0, grid.rows as i64)
         .narrow(3, 0, grid.cols as i64)
+}
+
+/// By FFT over columns and, at each of their frequencies, one product of matrices over channels and rows.
+fn correlate_in_column_frequencies(key: &Tensor, windows: &Tensor, grid: &Grid) -> Tensor {
+    let size = windows.size();
+    let [samples, turns, channels, window] = [size[0], size[1], size[2], size[3]];
+    let (rows, cols) = (grid.rows as i64, grid.cols as i64);
+    let fft_size = fast_size(key.size()[3]);
+    let frequencies = fft_size / 2 + 1;
+    let shifted = key
+        .fft_rfft(fft_size, -1, "backward")
+        .unfold(2, rows, 1)
+        .narrow(2, 0, window)
+        .permute([0, 3, 1, 2, 4])
+        .reshape([samples * frequencies, channels * window, rows]);
+    let windows = windows
+        .fft_rfft(fft_size, -1, "backward")
+        .conj()
+        .permute([0, 4, 1, 2, 3])
+        .reshape([samples * frequencies, turns, channels * window]);
+    windows
+        .bmm(&shifted)
+        .view([samples, frequencies, turns, rows])
+        .permute([0, 2, 3, 1])
+        .fft_irfft(fft_size, -1, "backward")
+        .narrow(3, 0, cols)
 }
 
 /// The smallest size from `least` up that is even and has no prime factor above 5.
@@ -88,4 +126,182 @@ fn fast_size(least: i64) -> i64 {
         rest == 1 && size % 2 == 0
     };
     (least..).find(fast).unwrap_or(least)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::f64::consts::TAU;
+    use tch::Device;
+
+    const DOUBLE: (Kind, Device) = (Kind::Double, Device::Cpu);
+
+    fn grid(rows: usize, cols: usize, window: usize) -> Grid {
+        Grid {
+            rows,
+            cols,
+            stride: 1,
+            window,
+            margin: window / 2,
+            query_margin: 0,
+            sampling: Interpolation::Bilinear,
+            subcell: false,
+        }
+    }
+
+    fn noise(size: &[i64], seed: i64) -> Tensor {
+        let len: i64 = size.iter().product();
+        (Tensor::arange(len, DOUBLE) * 12.9898 + seed)
+            .sin()
+            .view(size)
+            * 3.0
+    }
+
+    #[test]
+    fn both_ways_agree_with_the_definition() {
+        // An odd window with its margin on both sides, and an even one whose last margin cell is unused.
+        for (window, rows, cols) in [(5, 12, 10), (6, 14, 16)] {
+            let grid = grid(rows, cols, window);
+            let margin = 2 * grid.margin as i64;
+            let key = noise(&[2, 3, rows as i64 + margin, cols as i64 + margin], 1);
+            let windows = noise(&[2, 4, 3, window as i64, window as i64], 2);
+            let direct: Vec<Tensor> = (0..2)
+                .map(|sample| {
+                    let key = key.narrow(0, sample, 1);
+                    key.conv2d(
+                        &windows.select(0, sample),
+                        None::<&Tensor>,
+                        [1, 1],
+                        [0, 0],
+                        [1, 1],
+                        1,
+                    )
+                })
+                .collect();
+            let direct =
+                Tensor::cat(&direct, 0)
+                    .narrow(2, 0, rows as i64)
+                    .narrow(3, 0, cols as i64);
+            for way in [correlate_in_frequencies, correlate_in_column_frequencies] {
+                let error = (way(&key, &windows, &grid) - &direct)
+                    .abs()
+                    .max()
+                    .double_value(&[]);
+                assert!(error < 1e-10, "{error}");
+            }
+        }
+    }
+
+    #[test]
+    fn both_ways_have_the_same_gradients() {
+        let grid = grid(12, 10, 5);
+        let weight = noise(&[1, 3, 12, 10], 3);
+        let gradients = [correlate_in_frequencies, correlate_in_column_frequencies].map(|way| {
+            let key = noise(&[1, 2, 16, 14], 1).set_requires_grad(true);
+            let windows = noise(&[1, 3, 2, 5, 5], 2).set_requires_grad(true);
+            let loss = (way(&key, &windows, &grid) * &weight).sum(None::<Kind>);
+            Tensor::run_backward(&[loss], &[key, windows], false, false)
+        });
+        for index in 0..2 {
+            let error = (&gradients[0][index] - &gradients[1][index])
+                .abs()
+                .max()
+                .double_value(&[]);
+            assert!(error < 1e-10, "{error}");
+        }
+    }
+
+    /// An image of an L of six soft dots: asymmetric, so that every wrong turn or mirror shows. Its corner
+    /// lies at `corner` (x, y); the long arm points along +x, the short one along +y, both turned by
+    /// `angle`.
+    fn letter(size: i64, corner: Point2<f64>, angle: f64) -> Tensor {
+        let dots = [(0., 0.), (3., 0.), (6., 0.), (9., 0.), (0., 3.), (0., 6.)];
+        let dots = dots.map(|(x, y)| corner + Rotation2::new(angle) * Vector2::new(x, y));
+        let cells = (0..size * size).map(|index| {
+            let cell = Point2::new((index % size) as f64, (index / size) as f64);
+            dots.iter()
+                .map(|dot| (-(cell - dot).norm_squared() / 2.0).exp())
+                .sum()
+        });
+        Tensor::from_slice(&cells.collect::<Vec<f64>>()).view([1, 1, size, size])
+    }
+
+    #[test]
+    fn an_l_is_found_where_it_went_and_how_it_was_turned() {
+        const SIZE: i64 = 64;
+        let mut grid = grid(SIZE as usize, SIZE as usize, 25);
+        for sampling in [Interpolation::Nearest, Interpolation::Bilinear] {
+            grid.sampling = sampling;
+            for rotation in [0, 1, 4, 9, 14, 18, 27, 35] {
+                let turn = TAU * rotation as f64 / 36.0;
+                // It lies turned already: the wanted turn is relative to that.
+                let (first, from) = (0.3, Point2::new(20.0, 22.0));
+                let (pick, place) = (from, Point2::new(40.0, 37.0));
+                let query = letter(SIZE, from, first);
+                let key = letter(SIZE, place, first + turn);
+                let turns = [(0..36).collect()];
+                let windows = rotated_windows(&query, 0, &grid, sampling, &[pick], &turns, 36);
+                let key = key.constant_pad_nd([grid.margin as i64; 4]);
+                let scores = correlate(&key, &windows, &grid);
+                let best = scores.argmax(None, false).int64_value(&[]);
+                let (index, row, col) = (best / (SIZE * SIZE), best / SIZE % SIZE, best % SIZE);
+                assert_eq!((index, row, col), (rotation, 37, 40), "{sampling:?}");
+            }
+        }
+    }
+
+    #[test]
+    fn quarter_turns_move_whole_cells() {
+        // At a quarter turn the window's +x is the image's -y side: R(-90 deg) (1, 0) = (0, -1).
+        let features = Tensor::arange(49, DOUBLE).view([1, 1, 7, 7]);
+        let grid = grid(7, 7, 3);
+        for sampling in [Interpolation::Nearest, Interpolation::Bilinear] {
+            let center = [Point2::new(3.0, 3.0)];
+            let windows = rotated_windows(&features, 0, &grid, sampling, &center, &[vec![0, 1]], 4);
+            let values = |turn: i64| {
+                Vec::<f64>::try_from(windows.get(0).get(turn).round().flatten(0, -1)).unwrap()
+            };
+            assert_eq!(values(0), [16., 17., 18., 23., 24., 25., 30., 31., 32.]);
+            assert_eq!(values(1), [30., 23., 16., 31., 24., 17., 32., 25., 18.]);
+        }
+    }
+
+    #[test]
+    fn windows_over_the_edge_are_zero_there() {
+        let features = Tensor::ones([1, 1, 6, 6], DOUBLE);
+        let grid = grid(6, 6, 3);
+        let corner = [Point2::new(0.0, 0.0)];
+        let windows = rotated_windows(
+            &features,
+            0,
+            &grid,
+            Interpolation::Nearest,
+            &corner,
+            &[vec![0]],
+            36,
+        );
+        let values = Vec::<f64>::try_from(windows.flatten(0, -1)).unwrap();
+        assert_eq!(values, [0., 0., 0., 0., 1., 1., 0., 1., 1.]);
+    }
+
+    #[test]
+    fn a_margin_shifts_the_centre() {
+        let inner = noise(&[1, 2, 9, 8], 5);
+        let center = [Point2::new(3.25, 4.5)];
+        let turns = [vec![0, 3, 11]];
+        let grid = grid(9, 8, 5);
+        let sampling = Interpolation::Bilinear;
+        let plain = rotated_windows(&inner, 0, &grid, sampling, &center, &turns, 36);
+        let padded = inner.constant_pad_nd([4; 4]);
+        let shifted = rotated_windows(&padded, 4, &grid, sampling, &center, &turns, 36);
+        assert!((plain - shifted).abs().max().double_value(&[]) < 1e-12);
+    }
+
+    #[test]
+    fn transform_sizes_are_even_and_smooth() {
+        assert_eq!(
+            [184, 104, 384, 224, 7].map(fast_size),
+            [192, 108, 384, 240, 8]
+        );
+    }
 }

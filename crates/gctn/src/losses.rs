@@ -93,7 +93,7 @@ pub(crate) fn place_logits(
     correlate(&features.key, &windows, grid) * &features.scale
 }
 
-fn query_windows(
+pub(crate) fn query_windows(
     grid: &Grid,
     features: &Features,
     picks_px: &[Point2<f64>],

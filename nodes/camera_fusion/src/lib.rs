@@ -1,1 +1,272 @@
 //! Node that fuses camera views into heightmaps.
+//!
+//! What belongs together and what is wrong with it is decided in [`Views`], which knows no ROS node.
+
+mod extrinsics;
+mod parameters;
+mod views;
+
+use std::{
+    collections::BTreeMap,
+    path::Path,
+    sync::Arc,
+    time::{Duration, Instant},
+};
+
+use msgs::{
+    convert,
+    grid_map_msgs::GridMap,
+    sctn_msgs,
+    sensor_msgs::{CameraInfo, Image},
+    tf2_msgs::TFMessage,
+};
+use node_kit::{Level, Node, Publisher, Qos, Statistics};
+use tokio::sync::mpsc;
+use tracing::{info, warn};
+
+pub use extrinsics::{CalibrationError, TransformError, Transforms, Unconnected, read_calibration};
+pub use parameters::{CameraFusionParameters, WorkspaceParameters};
+pub use views::{Complaint, Fused, Stream, Views};
+
+/// Messages between their subscriptions and the fusion.
+const WAITING_ARRIVALS: usize = 32;
+/// How often silent cameras are looked for.
+const LOOK_PERIOD: Duration = Duration::from_millis(250);
+
+/// What a camera has sent.
+enum Arrival {
+    Image(usize, Stream, Image),
+    Info(usize, CameraInfo),
+}
+
+/// Runs the node.
+pub async fn run(node: Node, parameters: CameraFusionParameters) -> anyhow::Result<()> {
+    let poses = if parameters.calibration == Path::new("") {
+        BTreeMap::new()
+    } else {
+        read_calibration(&parameters.calibration)?
+    };
+    if let Some(stranger) = poses.keys().find(|name| !parameters.cameras.contains(name)) {
+        warn!("calibration: camera {stranger} is not among the parameter cameras");
+    }
+    let mut fusion = FusionNode::new(&node, &parameters, poses)?;
+    let mut transforms = node.subscription::<TFMessage>("/tf_static", Qos::Latched)?;
+    let (sender, mut arrivals) = mpsc::channel(WAITING_ARRIVALS);
+    for (index, camera) in parameters.cameras.iter().enumerate() {
+        fusion.listen(&node, index, camera, &sender)?;
+    }
+    drop(sender);
+    let mut look = tokio::time::interval(LOOK_PERIOD);
+    loop {
+        tokio::select! {
+            arrival = arrivals.recv() => match arrival {
+                Some(arrival) => fusion.arrived(arrival),
+                None => return Ok(()),
+            },
+            message = transforms.recv() => {
+                for reason in fusion.views.transform(message) {
+                    transforms.reject(reason);
+                }
+                fusion.fuse();
+            }
+            _ = look.tick() => fusion.look_for_silent_cameras(&node),
+        }
+    }
+}
+
+struct FusionNode {
+    views: Views,
+    cameras: Vec<CameraTopics>,
+    timeout: Duration,
+    heightmap: Publisher<sctn_msgs::Heightmap>,
+    grid_map: Publisher<GridMap>,
+    preview: Publisher<Image>,
+    last_fusion: Duration,
+    fused: u64,
+}
+
+/// Counters and ages of one camera.
+struct CameraTopics {
+    name: String,
+    color: Arc<Statistics>,
+    depth: Arc<Statistics>,
+    info: Arc<Statistics>,
+    color_arrival: Option<Instant>,
+    depth_arrival: Option<Instant>,
+    silent: bool,
+}
+
+impl FusionNode {
+    fn new(
+        node: &Node,
+        parameters: &CameraFusionParameters,
+        poses: BTreeMap<String, nalgebra::Isometry3<f64>>,
+    ) -> anyhow::Result<Self> {
+        Ok(Self {
+            views: Views::new(parameters, poses),
+            cameras: Vec::new(),
+            timeout: Duration::from_secs_f64(parameters.camera_timeout_s),
+            heightmap: node.publisher("heightmap", Qos::Latched)?,
+            grid_map: node.publisher("heightmap/grid_map", Qos::Latched)?,
+            preview: node.publisher("heightmap/image", Qos::Latched)?,
+            last_fusion: Duration::ZERO,
+            fused: 0,
+        })
+    }
+
+    /// Subscribes to one camera; each stream is decoded in a task of its own.
+    fn listen(
+        &mut self,
+        node: &Node,
+        index: usize,
+        camera: &str,
+        arrivals: &mpsc::Sender<Arrival>,
+    ) -> anyhow::Result<()> {
+        let color = format!("{camera}/color/image_raw");
+        let depth = format!("{camera}/depth/image_rect_raw");
+        let mut images = Vec::new();
+        for (topic, stream) in [(color, Stream::Color), (depth, Stream::Depth)] {
+            let mut subscription = node.subscription::<Image>(&topic, Qos::Image)?;
+            images.push(Arc::clone(subscription.statistics()));
+            let arrivals = arrivals.clone();
+            node.spawn(async move {
+                loop {
+                    let image = subscription.recv().await;
+                    if arrivals
+                        .send(Arrival::Image(index, stream, image))
+                        .await
+                        .is_err()
+                    {
+                        return;
+                    }
+                }
+            });
+        }
+        let topic = format!("{camera}/color/camera_info");
+        let mut subscription = node.subscription::<CameraInfo>(&topic, Qos::Image)?;
+        self.cameras.push(CameraTopics {
+            name: camera.to_owned(),
+            depth: images.remove(1),
+            color: images.remove(0),
+            info: Arc::clone(subscription.statistics()),
+            color_arrival: None,
+            depth_arrival: None,
+            silent: false,
+        });
+        let arrivals = arrivals.clone();
+        node.spawn(async move {
+            loop {
+                let info = subscription.recv().await;
+                if arrivals.send(Arrival::Info(index, info)).await.is_err() {
+                    return;
+                }
+            }
+        });
+        Ok(())
+    }
+
+    fn arrived(&mut self, arrival: Arrival) {
+        let taken = match arrival {
+            Arrival::Info(camera, info) => self.views.calibrate(camera, &info).map(|()| false),
+            Arrival::Image(camera, stream, image) => {
+                let topics = &mut self.cameras[camera];
+                let arrival = match stream {
+                    Stream::Depth => &mut topics.depth_arrival,
+                    Stream::Color | Stream::Info => &mut topics.color_arrival,
+                };
+                *arrival = Some(Instant::now());
+                self.views.image(camera, stream, image)
+            }
+        };
+        match taken {
+            Ok(set_back) => {
+                if set_back {
+                    info!("the clock was set back: older images are forgotten");
+                }
+                self.fuse();
+            }
+            Err(complaint) => self.complain(&complaint),
+        }
+    }
+
+    fn fuse(&mut self) {
+        let start = Instant::now();
+        match self.views.fuse() {
+            Ok(None) => {}
+            Ok(Some(fused)) => self.publish(fused, start),
+            Err(complaints) => complaints.iter().for_each(|bad| self.complain(bad)),
+        }
+    }
+
+    fn publish(&mut self, fused: Fused, start: Instant) {
+        let header = fused.message.header.clone();
+        self.heightmap.publish(fused.message);
+        self.last_fusion = start.elapsed();
+        self.fused += 1;
+        self.grid_map
+            .publish(convert::grid_map(&fused.heightmap, header.clone()));
+        match convert::preview_image(&fused.heightmap, header) {
+            Ok(image) => self.preview.publish(image),
+            Err(error) => self.preview.statistics().reject(error),
+        }
+    }
+
+    fn complain(&self, complaint: &Complaint) {
+        let topics = &self.cameras[complaint.camera];
+        let statistics = match complaint.stream {
+            Stream::Color => &topics.color,
+            Stream::Depth => &topics.depth,
+            Stream::Info => &topics.info,
+        };
+        statistics.reject(&complaint.reason);
+    }
+
+    /// A camera is silent when nothing has come from it for the timeout while something has from
+    /// another. When nothing comes from any, the cell is moving, or gone.
+    fn look_for_silent_cameras(&mut self, node: &Node) {
+        let timeout = self.timeout;
+        let recent = |arrival: Option<Instant>| arrival.is_some_and(|at| at.elapsed() <= timeout);
+        let any = self
+            .cameras
+            .iter()
+            .any(|camera| recent(camera.color_arrival) || recent(camera.depth_arrival));
+        for camera in &mut self.cameras {
+            let missing: Vec<&str> = [
+                ("colour", camera.color_arrival),
+                ("depth", camera.depth_arrival),
+            ]
+            .into_iter()
+            .filter(|(_, arrival)| !recent(*arrival))
+            .map(|(stream, _)| stream)
+            .collect();
+            let silent = any && !missing.is_empty();
+            if silent && !camera.silent {
+                warn!(
+                    "camera {}: no {} image for {timeout:?} while other images arrive; no heightmap \
+                     without it",
+                    camera.name,
+                    missing.join(" and ")
+                );
+            } else if camera.silent && missing.is_empty() {
+                info!("camera {}: images arrive again", camera.name);
+            }
+            camera.silent = silent || (camera.silent && !missing.is_empty());
+            let (level, message) = match (missing.is_empty(), any) {
+                (true, _) => (Level::Ok, "images arrive".to_owned()),
+                (false, true) => (Level::Error, format!("no {} image", missing.join(" and "))),
+                (false, false) => (Level::Stale, "no camera sends images".to_owned()),
+            };
+            node.diagnostics()
+                .set(format!("camera {}", camera.name), level, message, []);
+        }
+        node.diagnostics().set(
+            "fusion",
+            Level::Ok,
+            format!("{} heightmaps", self.fused),
+            [(
+                "last_image_to_heightmap_ms",
+                format!("{:.2}", self.last_fusion.as_secs_f64() * 1e3),
+            )],
+        );
+    }
+}

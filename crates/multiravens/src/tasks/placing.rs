@@ -44,10 +44,10 @@ const TILT_TOLERANCE_RAD: f64 = 0.1;
 const SETTINGS: PrimitiveSettings = PrimitiveSettings {
     clearance_m: 0.08,
     lift_m: 0.05,
-    travel_m_s: 0.8,
-    carry_m_s: 0.5,
-    descend_m_s: 0.1,
-    acceleration_m_s2: 2.5,
+    travel_m_s: 1.2,
+    carry_m_s: 0.8,
+    descend_m_s: 0.2,
+    acceleration_m_s2: 4.0,
 };
 
 /// Parameters of the module in a problem file.

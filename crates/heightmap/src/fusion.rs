@@ -1,6 +1,10 @@
 //! Fusion of RGB-D views into a heightmap.
 
-use crate::{Camera, Heightmap};
+use crate::{Camera, Heightmap, Intrinsics, Workspace};
+use nalgebra::Vector3;
+
+/// More views would overflow the sums of colours.
+const MAX_VIEWS: usize = 128;
 
 /// One RGB-D image and the camera that took it.
 #[derive(Clone, Copy, Debug)]
@@ -37,20 +41,407 @@ pub enum FusionError {
         /// Elements expected.
         expected: usize,
     },
+    /// More views than can be summed.
+    #[error("{actual} views, expected at most 128")]
+    Views {
+        /// Views given.
+        actual: usize,
+    },
 }
 
 /// Fuses views; owns the scratch memory so that a fusion allocates nothing.
 #[derive(Debug, Default)]
-pub struct Fusion {}
+pub struct Fusion {
+    /// Highest point of each cell in the present view, packed so that the maximum is one comparison:
+    /// ordered bits of the height above, colour below. One more slot takes what falls off the grid.
+    highest: Vec<u64>,
+    /// Per cell: sum of each colour, and the number of views that saw it.
+    colors: Vec<[u16; 4]>,
+    /// Slot and ordered height bits of each pixel of an image row.
+    row: Vec<(u32, u32)>,
+}
 
 impl Fusion {
     /// Highest point per cell wins; colour is the mean over the views that saw the cell
     /// (Zeng et al., CoRL 2020). Overwrites `out`, whose workspace says what to cover.
     pub fn fuse(
         &mut self,
-        _views: &[View<'_>],
-        _out: &mut Heightmap,
+        views: &[View<'_>],
+        out: &mut Heightmap,
     ) -> Result<FusionReport, FusionError> {
-        todo!()
+        for view in views {
+            view.check()?;
+        }
+        if views.len() > MAX_VIEWS {
+            return Err(FusionError::Views {
+                actual: views.len(),
+            });
+        }
+        let Heightmap {
+            workspace,
+            rgb,
+            height_m,
+        } = out;
+        let cells = workspace.len();
+        rgb.resize(3 * cells, 0);
+        height_m.resize(cells, 0.0);
+        height_m.fill(f32::NEG_INFINITY);
+        self.colors.clear();
+        self.colors.resize(cells, [0; 4]);
+        for view in views {
+            self.project(view, workspace);
+            let seen = self.highest[..cells]
+                .iter()
+                .zip(&mut *height_m)
+                .zip(&mut self.colors);
+            for ((&key, height_m), color) in seen {
+                if key == 0 {
+                    continue;
+                }
+                *height_m = height_m.max(from_ordered((key >> 32) as u32));
+                let [blue, green, red, _] = (key as u32).to_le_bytes().map(u16::from);
+                *color = [
+                    color[0] + red,
+                    color[1] + green,
+                    color[2] + blue,
+                    color[3] + 1,
+                ];
+            }
+        }
+        let mut seen = 0;
+        let pixels = rgb.chunks_exact_mut(3).zip(height_m).zip(&self.colors);
+        for ((pixel, height_m), &[red, green, blue, views]) in pixels {
+            if views == 0 {
+                pixel.fill(0);
+                *height_m = 0.0;
+                continue;
+            }
+            seen += 1;
+            let mean = |sum: u16| ((sum + views / 2) / views) as u8;
+            pixel.copy_from_slice(&[mean(red), mean(green), mean(blue)]);
+        }
+        Ok(FusionReport {
+            views: views.len(),
+            coverage: seen as f64 / cells.max(1) as f64,
+        })
+    }
+
+    /// Finds the highest point of each cell in one view.
+    fn project(&mut self, view: &View<'_>, workspace: &Workspace) {
+        let cells = workspace.len();
+        self.highest.clear();
+        self.highest.resize(cells + 1, 0);
+        let Intrinsics {
+            width,
+            height,
+            fx_px,
+            fy_px,
+            cx_px,
+            cy_px,
+        } = view.camera.intrinsics;
+        self.row.resize(width, (0, 0));
+        // In units of cells, from the grid's corner; z stays in metres. A pixel (u, v) at depth d lies at
+        // d (u per_column + start_of_row(v)) + origin.
+        let scale = 1.0 / workspace.pixel_size_m;
+        let to_cells = |v: Vector3<f64>| Vector3::new(v.x * scale, v.y * scale, v.z);
+        let pose = &view.camera.world_from_camera;
+        let corner = Vector3::new(workspace.origin_m.x, workspace.origin_m.y, 0.0);
+        let origin = to_cells(pose.translation.vector - corner).cast::<f32>();
+        let per_column =
+            to_cells(pose.rotation * Vector3::new(1.0 / fx_px, 0.0, 0.0)).cast::<f32>();
+        let (cols, rows) = (workspace.cols as f32, workspace.rows as f32);
+        let (z_min_m, z_max_m) = (workspace.z_min_m as f32, workspace.z_max_m as f32);
+        for v in 0..height {
+            let start = Vector3::new(-cx_px / fx_px, (v as f64 - cy_px) / fy_px, 1.0);
+            let start = to_cells(pose.rotation * start).cast::<f32>();
+            let depths = &view.depth_m[v * width..][..width];
+            for (u, (slot, &depth_m)) in self.row.iter_mut().zip(depths).enumerate() {
+                let u = u as f32;
+                let x = depth_m * (u * per_column.x + start.x) + origin.x;
+                let y = depth_m * (u * per_column.y + start.y) + origin.y;
+                let z_m = depth_m * (u * per_column.z + start.z) + origin.z;
+                // A depth that is not a number fails every comparison.
+                let inside = (depth_m > 0.0)
+                    & (x >= 0.0)
+                    & (x < cols)
+                    & (y >= 0.0)
+                    & (y < rows)
+                    & (z_m >= z_min_m)
+                    & (z_m <= z_max_m);
+                let cell = (y as u32)
+                    .wrapping_mul(workspace.cols as u32)
+                    .wrapping_add(x as u32);
+                *slot = (if inside { cell } else { cells as u32 }, ordered(z_m));
+            }
+            let colors = view.rgb[3 * v * width..][..3 * width].chunks_exact(3);
+            for (&(slot, z), color) in self.row.iter().zip(colors) {
+                let color = u32::from_le_bytes([color[2], color[1], color[0], 0]);
+                let key = u64::from(z) << 32 | u64::from(color);
+                let highest = &mut self.highest[slot as usize];
+                *highest = key.max(*highest);
+            }
+        }
+    }
+}
+
+/// Bits of a float in the order of its value; never 0 for a finite one.
+fn ordered(value: f32) -> u32 {
+    let bits = value.to_bits();
+    bits ^ (((bits as i32 >> 31) as u32) | 0x8000_0000)
+}
+
+/// The float of [`ordered`] bits.
+fn from_ordered(bits: u32) -> f32 {
+    let flip = if bits & 0x8000_0000 == 0 {
+        u32::MAX
+    } else {
+        0x8000_0000
+    };
+    f32::from_bits(bits ^ flip)
+}
+
+impl View<'_> {
+    fn check(&self) -> Result<(), FusionError> {
+        let Intrinsics { width, height, .. } = self.camera.intrinsics;
+        let pixels = width * height;
+        for (what, actual, expected) in [
+            ("colour image", self.rgb.len(), 3 * pixels),
+            ("depth image", self.depth_m.len(), pixels),
+        ] {
+            if actual != expected {
+                let camera = self.camera.name.clone();
+                return Err(FusionError::Size {
+                    camera,
+                    what,
+                    actual,
+                    expected,
+                });
+            }
+        }
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::Pixel;
+    use nalgebra::{Isometry3, Point2, Point3, Translation3, UnitQuaternion};
+    use proptest::prelude::*;
+
+    const SMALL: Intrinsics = Intrinsics {
+        width: 40,
+        height: 30,
+        fx_px: 40.0,
+        fy_px: 40.0,
+        cx_px: 20.0,
+        cy_px: 15.0,
+    };
+
+    /// Looks straight down from a metre above a point; the image's x runs along the world's x.
+    fn above(x_m: f64, y_m: f64) -> Camera {
+        let down = UnitQuaternion::from_axis_angle(&Vector3::x_axis(), std::f64::consts::PI);
+        let world_from_camera = Isometry3::from_parts(Translation3::new(x_m, y_m, 1.0), down);
+        Camera {
+            name: "above".into(),
+            intrinsics: SMALL,
+            world_from_camera,
+        }
+    }
+
+    fn images(depth_m: f32, rgb: [u8; 3]) -> (Vec<u8>, Vec<f32>) {
+        let pixels = SMALL.width * SMALL.height;
+        (rgb.repeat(pixels), vec![depth_m; pixels])
+    }
+
+    /// The definition, point by point in double precision.
+    fn reference(views: &[View<'_>], workspace: Workspace) -> Heightmap {
+        let mut out = Heightmap::new(workspace);
+        let mut sums = vec![[0u32; 4]; workspace.len()];
+        for view in views {
+            let mut highest: Vec<Option<(f64, [u8; 3])>> = vec![None; workspace.len()];
+            let width = view.camera.intrinsics.width;
+            for (index, &depth_m) in view.depth_m.iter().enumerate() {
+                if !(depth_m > 0.0 && depth_m.is_finite()) {
+                    continue;
+                }
+                let image = Point2::new((index % width) as f64, (index / width) as f64);
+                let point = view.camera.back_project(&image, f64::from(depth_m));
+                let inside = (workspace.z_min_m..=workspace.z_max_m).contains(&point.z);
+                let Some(Pixel { row, col }) = workspace.pixel(&point.xy()).filter(|_| inside)
+                else {
+                    continue;
+                };
+                let color = [0, 1, 2].map(|channel| view.rgb[3 * index + channel]);
+                let cell = &mut highest[row * workspace.cols + col];
+                if cell.is_none_or(|(z, _)| point.z > z) {
+                    *cell = Some((point.z, color));
+                }
+            }
+            for (index, (z, color)) in highest
+                .iter()
+                .enumerate()
+                .filter_map(|(i, h)| Some((i, (*h)?)))
+            {
+                let height_m = &mut out.height_m[index];
+                *height_m = if sums[index][3] == 0 {
+                    z as f32
+                } else {
+                    height_m.max(z as f32)
+                };
+                for channel in 0..3 {
+                    sums[index][channel] += u32::from(color[channel]);
+                }
+                sums[index][3] += 1;
+            }
+        }
+        for (index, [red, green, blue, count]) in sums.into_iter().enumerate() {
+            for (channel, sum) in [red, green, blue].into_iter().enumerate() {
+                out.rgb[3 * index + channel] = sum
+                    .checked_div(count)
+                    .map_or(0, |_| ((sum + count / 2) / count) as u8);
+            }
+        }
+        out
+    }
+
+    #[test]
+    fn the_mean_colour_and_the_greatest_height_of_the_views_win() {
+        let camera = above(0.5, 0.0);
+        let (red, low) = images(1.0, [200, 0, 0]);
+        let (blue, high) = images(0.9, [0, 0, 101]);
+        let views = [
+            View {
+                camera: &camera,
+                rgb: &red,
+                depth_m: &low,
+            },
+            View {
+                camera: &camera,
+                rgb: &blue,
+                depth_m: &high,
+            },
+        ];
+        let mut out = Heightmap::new(Workspace::RAVENS);
+        let report = Fusion::default().fuse(&views, &mut out).unwrap();
+        assert_eq!(report.views, 2);
+        assert!(
+            report.coverage > 0.0 && report.coverage < 0.1,
+            "{}",
+            report.coverage
+        );
+        // The pixel at the principal point hits (0.5, 0) in both views.
+        let pixel = Workspace::RAVENS
+            .pixel(&Point2::new(0.5 + 1e-4, 1e-4))
+            .unwrap();
+        assert!((out.height_at_m(pixel) - 0.1).abs() < 1e-6);
+        let index = pixel.row * 160 + pixel.col;
+        assert_eq!(out.rgb[3 * index..][..3], [100, 0, 51]);
+    }
+
+    #[test]
+    fn what_is_no_depth_is_not_seen() {
+        let camera = above(0.5, 0.0);
+        for depth_m in [0.0, -1.0, f32::NAN, f32::INFINITY, f32::NEG_INFINITY] {
+            let (rgb, depth_m) = images(depth_m, [9, 9, 9]);
+            let mut out = Heightmap::new(Workspace::RAVENS);
+            out.rgb.fill(7);
+            let view = View {
+                camera: &camera,
+                rgb: &rgb,
+                depth_m: &depth_m,
+            };
+            let report = Fusion::default().fuse(&[view], &mut out).unwrap();
+            assert_eq!(report.coverage, 0.0);
+            assert_eq!(out, Heightmap::new(Workspace::RAVENS));
+        }
+    }
+
+    #[test]
+    fn an_image_of_another_size_is_refused_by_the_cameras_name() {
+        let camera = above(0.5, 0.0);
+        let (rgb, depth_m) = images(1.0, [0; 3]);
+        let mut out = Heightmap::new(Workspace::RAVENS);
+        let view = View {
+            camera: &camera,
+            rgb: &rgb[1..],
+            depth_m: &depth_m,
+        };
+        let error = Fusion::default()
+            .fuse(&[view], &mut out)
+            .unwrap_err()
+            .to_string();
+        assert!(error.contains("above") && error.contains("3600"), "{error}");
+        let view = View {
+            camera: &camera,
+            rgb: &rgb,
+            depth_m: &depth_m[1..],
+        };
+        assert!(Fusion::default().fuse(&[view], &mut out).is_err());
+    }
+
+    #[test]
+    fn ordered_bits_keep_the_order_and_the_value() {
+        let values = [
+            f32::NEG_INFINITY,
+            -1.0,
+            -2e-3,
+            -1e-30,
+            -0.0,
+            0.0,
+            1e-30,
+            0.28,
+            f32::INFINITY,
+        ];
+        for pair in values.windows(2) {
+            assert!(ordered(pair[0]) < ordered(pair[1]), "{pair:?}");
+        }
+        for value in values {
+            assert_eq!(from_ordered(ordered(value)).to_bits(), value.to_bits());
+            assert_ne!(ordered(value), 0);
+        }
+    }
+
+    proptest! {
+        #[test]
+        fn fusion_agrees_with_its_definition(
+            depths in prop::collection::vec(0.85f32..1.05, 1200),
+            x_m in 0.3..0.7, y_m in -0.4..0.4, yaw_rad in -3.0..3.0, tilt_rad in -0.5..0.5,
+        ) {
+            let mut camera = above(x_m, y_m);
+            let turn = UnitQuaternion::from_euler_angles(tilt_rad, 0.0, yaw_rad);
+            camera.world_from_camera.rotation = turn * camera.world_from_camera.rotation;
+            let rgb: Vec<u8> = (0..3600).map(|i| (i * 7 % 251) as u8).collect();
+            let second = Camera { world_from_camera: above(x_m, y_m).world_from_camera, ..camera.clone() };
+            let views = [
+                View { camera: &camera, rgb: &rgb, depth_m: &depths },
+                View { camera: &second, rgb: &rgb, depth_m: &depths },
+            ];
+            let mut out = Heightmap::new(Workspace::RAVENS);
+            Fusion::default().fuse(&views, &mut out).unwrap();
+            let expected = reference(&views, Workspace::RAVENS);
+            // A point on a cell's edge, or at the same height as another, may go either way in f32.
+            let close = |(a, b): (&f32, &f32)| (a - b).abs() < 1e-6;
+            let agree = out.height_m.iter().zip(&expected.height_m).filter(|pair| close(*pair)).count();
+            prop_assert!(agree >= out.height_m.len() - 4, "{agree}");
+            let agree = out.rgb.iter().zip(&expected.rgb).filter(|(a, b)| a == b).count();
+            prop_assert!(agree >= out.rgb.len() - 12, "{agree}");
+        }
+
+        #[test]
+        fn a_point_lands_in_the_cell_that_holds_it(x_m in 0.26..0.74, y_m in -0.49..0.49, z_m in 0.0..0.25) {
+            let mut camera = above(x_m, y_m);
+            camera.world_from_camera.translation.z = z_m + 1.0;
+            let (rgb, mut depth_m) = images(0.0, [1, 2, 3]);
+            depth_m[15 * SMALL.width + 20] = 1.0;
+            let mut out = Heightmap::new(Workspace::RAVENS);
+            Fusion::default().fuse(&[View { camera: &camera, rgb: &rgb, depth_m: &depth_m }], &mut out).unwrap();
+            let seen: Vec<_> = (0..out.height_m.len()).filter(|i| out.rgb[3 * i] == 1).collect();
+            prop_assert_eq!(seen.len(), 1);
+            let pixel = Pixel { row: seen[0] / 160, col: seen[0] % 160 };
+            let center = Workspace::RAVENS.center(pixel);
+            prop_assert!((center - Point3::new(x_m, y_m, z_m).xy()).amax() < 0.5 * 0.003125 + 1e-6);
+            prop_assert!((f64::from(out.height_at_m(pixel)) - z_m).abs() < 1e-6);
+        }
     }
 }

@@ -1,69 +1,335 @@
-//! Demonstrations: what was seen and done, step by step.
+//! Demonstrations as bags.
 
+use crate::{BagError, BagReader, BagWriter, Compression, Qos, RawMessage};
 use heightmap::Heightmap;
+use msgs::convert::{self, ConvertError};
+use msgs::sctn_msgs;
 use pick_place::{Outcome, PickPlace, PrimitiveSettings};
+use std::path::{Path, PathBuf};
+use std::time::Duration;
 
-/// A rollout of one episode: a demonstration, a run of a policy, or an operator's approved run.
+/// One step: what was seen, what was done, what came of it.
+#[derive(Clone, Debug, PartialEq)]
+pub struct DemonstrationStep {
+    /// The workspace before the action.
+    pub observation: Heightmap,
+    /// The action.
+    pub action: PickPlace,
+    /// Heights and speeds of the action.
+    pub settings: PrimitiveSettings,
+    /// Task module that the action belongs to.
+    pub module: String,
+    /// Change of the reward by the action.
+    pub delta_reward: f64,
+    /// How the action ended.
+    pub outcome: Outcome,
+}
+
+/// A sequence of steps that solves a problem.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Demonstration {
     /// Name of the problem.
     pub problem: String,
     /// Seed of the episode.
     pub seed: u64,
-    /// The steps, in order.
+    /// The steps.
     pub steps: Vec<DemonstrationStep>,
-    /// What was seen after the last step.
+    /// The workspace after the last step.
     pub last: Heightmap,
 }
 
-/// One step of a demonstration.
-#[derive(Clone, Debug, PartialEq)]
-pub struct DemonstrationStep {
-    /// What was seen before the action.
-    pub observation: Heightmap,
-    /// The action.
-    pub action: PickPlace,
-    /// Heights and speeds that the action was carried out with.
-    pub settings: PrimitiveSettings,
-    /// The task module that was being solved.
-    pub module: String,
-    /// Change of the reward by this step.
-    pub delta_reward: f64,
-    /// How the primitive ended.
-    pub outcome: Outcome,
+/// A bag that holds no demonstration.
+#[derive(Debug, thiserror::Error)]
+pub enum DemonstrationError {
+    /// The bag cannot be written or read.
+    #[error(transparent)]
+    Bag(#[from] BagError),
+    /// A note of the bag is missing or no value.
+    #[error("{}: no demonstration: custom_data.{key} is {actual:?}, expected {expected}", path.display())]
+    Note {
+        /// The bag.
+        path: PathBuf,
+        /// The note.
+        key: &'static str,
+        /// What it says.
+        actual: Option<String>,
+        /// What would do.
+        expected: &'static str,
+    },
+    /// A message cannot be converted.
+    #[error("{}: topic {topic}, step {step}: {source}", path.display())]
+    Message {
+        /// The bag.
+        path: PathBuf,
+        /// The topic.
+        topic: &'static str,
+        /// Number of the step, from 1.
+        step: usize,
+        /// What is wrong.
+        source: ConvertError,
+    },
+    /// Messages are missing or out of order.
+    #[error("{}: step {step}: {actual}, expected {expected}", path.display())]
+    Order {
+        /// The bag.
+        path: PathBuf,
+        /// Number of the step, from 1.
+        step: usize,
+        /// What came.
+        actual: String,
+        /// What should have come.
+        expected: &'static str,
+    },
 }
 
+const HEIGHTMAP: &str = "heightmap";
+const GOAL: &str = "goal";
+const PICK_PLACE: &str = "pick_place";
+const STEP_RESULT: &str = "step_result";
+const REWARD: &str = "reward";
+const FRAME: &str = "world";
+
+/// Demonstrations have no clock: the observation before step `index` is `index` seconds old.
+fn time(index: usize) -> Duration {
+    Duration::from_secs(index as u64)
+}
+
+/// Within the second of a step: when the action was decided and when it was over.
+const DECIDED: Duration = Duration::from_millis(250);
+const OVER: Duration = Duration::from_millis(750);
+
 impl Demonstration {
-    /// The demonstration sequence images v_1..v_D: what was seen after each positive delta reward
-    /// (paper, section IV-A).
-    pub fn goals(&self) -> impl Iterator<Item = &Heightmap> {
-        let after = self
+    /// The observations after each positive delta reward, in order: what a policy is to reach (v1 to vD in the paper).
+    pub fn goals(&self) -> Vec<&Heightmap> {
+        let reached = self
             .steps
             .iter()
-            .skip(1)
-            .map(|step| &step.observation)
-            .chain([&self.last]);
+            .enumerate()
+            .filter(|(_, step)| step.delta_reward > 0.0);
+        reached
+            .map(|(index, _)| self.observation(index + 1))
+            .collect()
+    }
+
+    /// The workspace before step `index`, from 0; after the last step for any larger one.
+    pub fn observation(&self, index: usize) -> &Heightmap {
         self.steps
-            .iter()
-            .zip(after)
-            .filter(|(step, _)| step.delta_reward > 0.0)
-            .map(|(_, after)| after)
+            .get(index)
+            .map_or(&self.last, |step| &step.observation)
+    }
+
+    /// Writes the bag. What an earlier try has left half-written is replaced, a whole bag is not.
+    pub fn write(&self, path: &Path) -> Result<(), DemonstrationError> {
+        BagWriter::discard_partial(path)?;
+        let mut bag = BagWriter::create(path, Compression::default())?;
+        bag.note("problem", &self.problem);
+        bag.note("seed", self.seed);
+        let heightmaps = bag.add::<sctn_msgs::Heightmap>(HEIGHTMAP, Qos::LATCHED)?;
+        let goals = bag.add::<sctn_msgs::Goal>(GOAL, Qos::LATCHED)?;
+        let actions = bag.add::<sctn_msgs::PickPlace>(PICK_PLACE, Qos::RELIABLE)?;
+        let results = bag.add::<sctn_msgs::StepResult>(STEP_RESULT, Qos::RELIABLE)?;
+        let rewards = bag.add::<sctn_msgs::Reward>(REWARD, Qos::RELIABLE)?;
+        let error = |topic, index| {
+            move |source| DemonstrationError::Message {
+                path: path.to_owned(),
+                topic,
+                step: index + 1,
+                source,
+            }
+        };
+        let heightmap = |index: usize| {
+            let header = convert::header(time(index), FRAME)?;
+            // How many views were fused is not part of a demonstration.
+            convert::heightmap_to_msg(self.observation(index).clone(), header, 0, 0.0)
+        };
+        let last_reward = self.steps.iter().rposition(|step| step.delta_reward > 0.0);
+        let mut total = 0.0;
+        for (index, step) in self.steps.iter().enumerate() {
+            bag.write(
+                heightmaps,
+                time(index),
+                &heightmap(index).map_err(error(HEIGHTMAP, index))?,
+            )?;
+            let header = convert::header(time(index), FRAME).map_err(error(PICK_PLACE, index))?;
+            let settings = convert::settings_to_msg(&step.settings);
+            let number = index as u32 + 1;
+            let rewarded = self.steps[index..]
+                .iter()
+                .position(|step| step.delta_reward > 0.0);
+            if let Some(goal) = rewarded.map(|ahead| index + ahead + 1) {
+                let message = sctn_msgs::Goal {
+                    header: header.clone(),
+                    problem: self.problem.clone(),
+                    demonstration: format!("{}/{}", self.problem, self.seed),
+                    step: number,
+                    step_count: self.steps.len() as u32,
+                    module: step.module.clone(),
+                    settings,
+                    heightmap: heightmap(goal).map_err(error(GOAL, index))?,
+                    ..Default::default()
+                };
+                bag.write(goals, time(index), &message)?;
+            }
+            let action = sctn_msgs::PickPlace {
+                header,
+                id: u64::from(number),
+                problem: self.problem.clone(),
+                step: number,
+                pick: convert::pose2d_to_msg(&step.action.pick),
+                place: convert::pose2d_to_msg(&step.action.place),
+                pick_score: 1.0,
+                place_score: 1.0,
+                settings,
+                module: step.module.clone(),
+                ..Default::default()
+            };
+            bag.write(actions, time(index) + DECIDED, &action)?;
+            let over = time(index) + OVER;
+            let header = convert::header(over, FRAME).map_err(error(STEP_RESULT, index))?;
+            let result = sctn_msgs::StepResult {
+                header: header.clone(),
+                proposal_id: u64::from(number),
+                outcome: convert::outcome_to_msg(step.outcome),
+                ..Default::default()
+            };
+            bag.write(results, over, &result)?;
+            total += step.delta_reward;
+            let complete = last_reward == Some(index);
+            bag.write(
+                rewards,
+                over,
+                &sctn_msgs::Reward {
+                    header,
+                    delta: step.delta_reward,
+                    total,
+                    complete,
+                },
+            )?;
+        }
+        let count = self.steps.len();
+        bag.write(
+            heightmaps,
+            time(count),
+            &heightmap(count).map_err(error(HEIGHTMAP, count))?,
+        )?;
+        Ok(bag.finish()?)
+    }
+
+    /// Reads a bag that [`Self::write`] wrote, one message at a time.
+    pub fn read(path: &Path) -> Result<Self, DemonstrationError> {
+        let bag = BagReader::open(path)?;
+        let note = |key: &'static str| bag.notes().get(key).cloned();
+        let bad = |key, expected| DemonstrationError::Note {
+            path: path.to_owned(),
+            key,
+            actual: note(key),
+            expected,
+        };
+        let problem = note("problem").ok_or_else(|| bad("problem", "the name of a problem"))?;
+        let seed = note("seed")
+            .and_then(|seed| seed.parse().ok())
+            .ok_or_else(|| bad("seed", "a seed"))?;
+
+        let mut messages = Steps {
+            path,
+            messages: bag.messages(),
+            step: 1,
+        };
+        let mut steps = Vec::new();
+        let mut observation = messages
+            .heightmap()?
+            .ok_or_else(|| messages.order("the end".into(), HEIGHTMAP))?;
+        while let Some(action) = messages.next::<sctn_msgs::PickPlace>(PICK_PLACE)? {
+            let settings =
+                messages.convert(PICK_PLACE, convert::settings_from_msg(&action.settings))?;
+            let poses = messages.convert(PICK_PLACE, convert::pick_place_from_msg(&action))?;
+            let result: sctn_msgs::StepResult = messages.expect(STEP_RESULT)?;
+            let outcome =
+                messages.convert(STEP_RESULT, convert::outcome_from_msg(result.outcome))?;
+            let reward: sctn_msgs::Reward = messages.expect(REWARD)?;
+            let next = messages
+                .heightmap()?
+                .ok_or_else(|| messages.order("the end".into(), HEIGHTMAP))?;
+            if !reward.delta.is_finite() {
+                return Err(messages.order(
+                    format!("a delta reward of {}", reward.delta),
+                    "a finite one",
+                ));
+            }
+            steps.push(DemonstrationStep {
+                observation: std::mem::replace(&mut observation, next),
+                action: poses,
+                settings,
+                module: action.module,
+                delta_reward: reward.delta,
+                outcome,
+            });
+            messages.step += 1;
+        }
+        Ok(Self {
+            problem,
+            seed,
+            steps,
+            last: observation,
+        })
     }
 }
 
-/// A bag that does not hold a demonstration. (Its reader and writer are being written.)
-#[derive(Debug, thiserror::Error)]
-#[error("{0}")]
-pub struct DemonstrationError(String);
+/// The messages of a demonstration in their order.
+struct Steps<'a> {
+    path: &'a Path,
+    messages: crate::Messages<'a>,
+    step: usize,
+}
 
-impl Demonstration {
-    /// Reads a demonstration.
-    pub fn read(_path: &std::path::Path) -> Result<Self, DemonstrationError> {
-        Err(DemonstrationError("not written yet".into()))
+impl Steps<'_> {
+    fn order(&self, actual: String, expected: &'static str) -> DemonstrationError {
+        DemonstrationError::Order {
+            path: self.path.to_owned(),
+            step: self.step,
+            actual,
+            expected,
+        }
     }
 
-    /// Writes a demonstration.
-    pub fn write(&self, _path: &std::path::Path) -> Result<(), DemonstrationError> {
-        Err(DemonstrationError("not written yet".into()))
+    fn convert<T>(
+        &self,
+        topic: &'static str,
+        result: Result<T, ConvertError>,
+    ) -> Result<T, DemonstrationError> {
+        let (path, step) = (self.path.to_owned(), self.step);
+        result.map_err(|source| DemonstrationError::Message {
+            path,
+            topic,
+            step,
+            source,
+        })
+    }
+
+    /// The next message, which must be of this topic; none at the end. Goals follow from the rest.
+    fn next<T: msgs::Interface>(
+        &mut self,
+        topic: &'static str,
+    ) -> Result<Option<T>, DemonstrationError> {
+        let other = |message: &Result<RawMessage, BagError>| !matches!(message, Ok(message) if message.topic.name == GOAL);
+        let Some(message) = self.messages.find(other).transpose()? else {
+            return Ok(None);
+        };
+        if message.topic.name != topic {
+            return Err(self.order(format!("a message on {}", message.topic.name), topic));
+        }
+        Ok(Some(message.decode()?))
+    }
+
+    fn expect<T: msgs::Interface>(&mut self, topic: &'static str) -> Result<T, DemonstrationError> {
+        self.next(topic)?
+            .ok_or_else(|| self.order("the end".into(), topic))
+    }
+
+    fn heightmap(&mut self) -> Result<Option<Heightmap>, DemonstrationError> {
+        let message = self.next::<sctn_msgs::Heightmap>(HEIGHTMAP)?;
+        message
+            .map(|message| self.convert(HEIGHTMAP, convert::heightmap_from_msg(message)))
+            .transpose()
     }
 }

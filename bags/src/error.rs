@@ -1,0 +1,130 @@
+//! What can go wrong with a bag.
+
+use mcap::McapError;
+use std::io;
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+/// A bag that cannot be written or read.
+#[derive(Debug, thiserror::Error)]
+pub enum BagError {
+    /// The system refused.
+    #[error("{}: {source}", path.display())]
+    Io {
+        /// File or folder.
+        path: PathBuf,
+        /// Why.
+        source: io::Error,
+    },
+    /// No space left.
+    #[error("{}: the disk is full; the messages up to the last flush are kept", path.display())]
+    DiskFull {
+        /// The file.
+        path: PathBuf,
+    },
+    /// Bags are never overwritten.
+    #[error("{}: exists already, expected a new name", path.display())]
+    Exists {
+        /// The folder.
+        path: PathBuf,
+    },
+    /// An earlier writer stopped half-way.
+    #[error("{}: a half-written bag of an earlier run, expected none; recover or remove it", path.display())]
+    HalfWritten {
+        /// The folder.
+        path: PathBuf,
+    },
+    /// Something else, or nothing.
+    #[error("{}: not a bag: {reason}", path.display())]
+    NotABag {
+        /// File or folder.
+        path: PathBuf,
+        /// What is missing.
+        reason: String,
+    },
+    /// The file has no end: its writer stopped half-way, or it was cut.
+    #[error("{}: ends early, expected a finished MCAP file; its writer stopped half-way or it was cut", path.display())]
+    Truncated {
+        /// The file.
+        path: PathBuf,
+    },
+    /// The contents contradict themselves.
+    #[error("{}: damaged: {reason}", path.display())]
+    Damaged {
+        /// The file.
+        path: PathBuf,
+        /// What was found.
+        reason: String,
+    },
+    /// A topic cannot have two types.
+    #[error("topic {topic} is written as {actual} already, expected {expected}")]
+    Conflict {
+        /// The topic.
+        topic: String,
+        /// Its type so far.
+        actual: String,
+        /// The type asked for.
+        expected: String,
+    },
+    /// A message of another type than asked for.
+    #[error("topic {topic} holds {actual}, expected {expected}")]
+    Type {
+        /// The topic.
+        topic: String,
+        /// Type found.
+        actual: String,
+        /// Type expected.
+        expected: String,
+    },
+    /// The type has changed since the bag was written.
+    #[error(
+        "topic {topic} was written with another definition of {type_name}: hash {actual}, expected {expected}"
+    )]
+    Definition {
+        /// The topic.
+        topic: String,
+        /// The type.
+        type_name: String,
+        /// Hash in the bag.
+        actual: String,
+        /// Hash of this program's definition.
+        expected: String,
+    },
+    /// A message that is none.
+    #[error("topic {topic} at {time:?}: {source}")]
+    Message {
+        /// The topic.
+        topic: String,
+        /// When it was logged.
+        time: Duration,
+        /// What is wrong.
+        source: msgs::CdrError,
+    },
+    /// A time that the format cannot hold.
+    #[error("time {0:?}, expected less than 2^64 ns")]
+    Time(Duration),
+}
+
+impl BagError {
+    pub(crate) fn io(path: &Path, source: io::Error) -> Self {
+        let path = path.to_owned();
+        match source.kind() {
+            io::ErrorKind::StorageFull | io::ErrorKind::QuotaExceeded => Self::DiskFull { path },
+            io::ErrorKind::UnexpectedEof => Self::Truncated { path },
+            _ => Self::Io { path, source },
+        }
+    }
+
+    pub(crate) fn mcap(path: &Path, error: McapError) -> Self {
+        match error {
+            McapError::Io(source) => Self::io(path, source),
+            McapError::UnexpectedEof | McapError::BadFooter => Self::Truncated {
+                path: path.to_owned(),
+            },
+            other => Self::Damaged {
+                path: path.to_owned(),
+                reason: other.to_string(),
+            },
+        }
+    }
+}

@@ -581,6 +581,17 @@ impl<A: Action + 'static> ActionClient<A> {
         })
     }
 
+    /// Asks the server to cancel all its goals: where the reply to a goal was lost, its state is
+    /// not known.
+    pub async fn cancel_all(&self, options: &CallOptions) -> Result<(), CallError> {
+        let _one_at_a_time = self.calls.cancel.lock().await;
+        attempt(&self.name, options, || {
+            self.client.async_cancel_goal(GoalId::ZERO, Time::ZERO)
+        })
+        .await
+        .map(|_| ())
+    }
+
     /// Absolute name of the action.
     pub fn name(&self) -> &str {
         &self.name

@@ -8,7 +8,6 @@ use std::time::Duration;
 
 use heightmap::{Heightmap, Workspace};
 use pick_place::{PickPlace, PrimitiveSettings};
-use ur5::Joints;
 
 use crate::status::DriverStatus;
 
@@ -69,6 +68,17 @@ pub enum Answer {
     Rejected,
     /// The operator withdrew the proposal by a stop.
     Stopped,
+}
+
+/// What has become of a proposal that arrived.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Proposed {
+    /// It can be approved.
+    Open,
+    /// It came before; nothing has changed.
+    Repeated,
+    /// It cannot be approved, for this reason.
+    Invalid(String),
 }
 
 /// What is to be done about a confirmation.
@@ -160,44 +170,46 @@ impl Gate {
         self.heightmaps.push_back((stamp, heightmap));
     }
 
-    /// Takes a proposal; it supersedes the one before.
-    ///
-    /// # Errors
-    /// What is wrong with it: it cannot be approved. A repeated message changes nothing.
-    pub fn propose(&mut self, proposal: Proposal) -> Result<(), String> {
-        let id = proposal.id;
-        if let Some(fate) = self.fate(id) {
-            return match &self.newest {
-                Some((newest, Ok(known))) if *newest == id && *known != proposal => {
-                    let reason = format!("proposal {id} came twice with different contents");
-                    self.newest = Some((id, Err(reason.clone())));
-                    Err(reason)
-                }
-                Some((newest, checked)) if *newest == id => {
-                    checked.as_ref().map(|_| ()).map_err(Clone::clone)
-                }
-                _ => Err(fate.reason(id)),
-            };
+    /// Takes a proposal, or what is wrong with the message of that id; it supersedes the one before.
+    pub fn propose(&mut self, id: u64, proposal: Result<Proposal, String>) -> Proposed {
+        if self.fate(id).is_some() {
+            if let Some((newest, known)) = &mut self.newest
+                && *newest == id
+                && known.is_ok()
+                && !same(known, &proposal)
+            {
+                let reason = format!("proposal {id} came twice with different contents");
+                *known = Err(reason.clone());
+                return Proposed::Invalid(reason);
+            }
+            return Proposed::Repeated;
         }
         self.set_fate_of_open(Fate::Superseded);
         if self.fates.len() == PROPOSALS {
             self.fates.pop_front();
         }
         self.fates.push_back((id, Fate::Open));
-        let checked = self.rules.check(&proposal);
-        self.newest = Some((id, checked.clone().map(|()| proposal)));
-        checked
+        let checked = proposal.and_then(|proposal| {
+            self.rules.check(&proposal)?;
+            Ok(proposal)
+        });
+        let proposed = match &checked {
+            Ok(_) => Proposed::Open,
+            Err(reason) => Proposed::Invalid(reason.clone()),
+        };
+        self.newest = Some((id, checked));
+        proposed
     }
 
     /// Takes a confirmation at a monotonic time. `plan` says why the motion cannot be planned from
-    /// the present joint positions, if it cannot.
+    /// where the robot is, if it cannot.
     pub fn confirm(
         &mut self,
         id: u64,
         decision: Decision,
         status: &DriverStatus,
         now: Duration,
-        plan: impl FnOnce(&Joints, &Proposal) -> Result<(), String>,
+        plan: impl FnOnce(&DriverStatus, &Proposal) -> Result<(), String>,
     ) -> Verdict {
         match decision {
             Decision::Approve => self.approve(id, status, now, plan),
@@ -220,7 +232,7 @@ impl Gate {
         id: u64,
         status: &DriverStatus,
         now: Duration,
-        plan: impl FnOnce(&Joints, &Proposal) -> Result<(), String>,
+        plan: impl FnOnce(&DriverStatus, &Proposal) -> Result<(), String>,
     ) -> Verdict {
         match self.fate(id) {
             None => return Verdict::Wait(format!("proposal {id} is unknown")),
@@ -253,10 +265,7 @@ impl Gate {
         if let Err(verdict) = self.unchanged(proposal) {
             return verdict;
         }
-        let Some((reading, _)) = status.joints else {
-            return Verdict::refuse(format!("proposal {id}: no joint_states have arrived"));
-        };
-        if let Err(reason) = plan(&reading.positions_rad, proposal) {
+        if let Err(reason) = plan(status, proposal) {
             return Verdict::refuse(format!("proposal {id}: {reason}"));
         }
         let proposal = Box::new(proposal.clone());
@@ -418,6 +427,11 @@ impl Rules {
     }
 }
 
+/// Whether a message says what is known. Broken ones are not compared: they hold NaN.
+fn same(known: &Result<Proposal, String>, repeated: &Result<Proposal, String>) -> bool {
+    matches!((known, repeated), (Ok(known), Ok(repeated)) if known == repeated)
+}
+
 fn seconds(stamp: Duration) -> String {
     format!("{:.3} s", stamp.as_secs_f64())
 }
@@ -472,7 +486,7 @@ mod tests {
     fn gate() -> Gate {
         let mut gate = Gate::new(rules());
         gate.observe(Duration::from_secs(5), Heightmap::new(Workspace::RAVENS));
-        gate.propose(proposal(7)).unwrap();
+        assert_eq!(gate.propose(7, Ok(proposal(7))), Proposed::Open);
         gate
     }
 
@@ -482,6 +496,14 @@ mod tests {
 
     fn approve(gate: &mut Gate, id: u64) -> Verdict {
         decide(gate, id, Decision::Approve)
+    }
+
+    #[track_caller]
+    fn invalid(gate: &mut Gate, proposal: Proposal) -> String {
+        match gate.propose(proposal.id, Ok(proposal)) {
+            Proposed::Invalid(reason) => reason,
+            other => panic!("expected an invalid proposal, found {other:?}"),
+        }
     }
 
     #[track_caller]
@@ -508,7 +530,7 @@ mod tests {
     fn nothing_moves_without_a_confirmation() {
         let mut gate = gate();
         gate.observe(Duration::from_secs(6), Heightmap::new(Workspace::RAVENS));
-        gate.propose(proposal(8)).unwrap();
+        assert_eq!(gate.propose(8, Ok(proposal(8))), Proposed::Open);
         assert_eq!(gate.moving(), None);
     }
 
@@ -529,7 +551,7 @@ mod tests {
     #[test]
     fn a_stale_approval_moves_nothing() {
         let mut gate = gate();
-        gate.propose(proposal(8)).unwrap();
+        assert_eq!(gate.propose(8, Ok(proposal(8))), Proposed::Open);
         let verdict = approve(&mut gate, 7);
         assert_refused(&gate, verdict, &["7", "superseded"]);
         // The newer one is not touched by that.
@@ -555,16 +577,12 @@ mod tests {
         let mut gate = gate();
         assert!(matches!(approve(&mut gate, 7), Verdict::Move(_)));
         gate.finish(Duration::from_secs(4));
-        gate.propose(proposal(7)).unwrap();
+        assert_eq!(gate.propose(7, Ok(proposal(7))), Proposed::Repeated);
         let verdict = approve(&mut gate, 7);
         assert_refused(&gate, verdict, &["already carried out"]);
         // Nor one from further back.
-        gate.propose(proposal(8)).unwrap();
-        assert!(
-            gate.propose(proposal(7))
-                .unwrap_err()
-                .contains("already carried out")
-        );
+        assert_eq!(gate.propose(8, Ok(proposal(8))), Proposed::Open);
+        assert_eq!(gate.propose(7, Ok(proposal(7))), Proposed::Repeated);
         let verdict = approve(&mut gate, 7);
         assert_refused(&gate, verdict, &["already carried out"]);
     }
@@ -588,7 +606,7 @@ mod tests {
     fn an_approval_while_moving_is_refused() {
         let mut gate = gate();
         assert!(matches!(approve(&mut gate, 7), Verdict::Move(_)));
-        gate.propose(proposal(8)).unwrap();
+        assert_eq!(gate.propose(8, Ok(proposal(8))), Proposed::Open);
         let verdict = approve(&mut gate, 8);
         assert!(
             matches!(&verdict, Verdict::Answer(Answer::Refused, r) if r.contains('8') && r.contains("proposal 7")),
@@ -612,7 +630,7 @@ mod tests {
                     _ => &mut bad_one.action.place,
                 };
                 pose.translation.x = bad;
-                let error = gate.propose(bad_one).unwrap_err();
+                let error = invalid(&mut gate, bad_one);
                 assert!(error.contains(which) && error.contains(expected), "{error}");
                 let verdict = approve(&mut gate, 8);
                 assert_refused(&gate, verdict, &["8", which, expected]);
@@ -624,7 +642,17 @@ mod tests {
         let mut gate = gate();
         let mut turned = proposal(8);
         turned.action.place = Isometry2::new(nalgebra::Vector2::new(0.5, 0.0), f64::NAN);
-        assert!(gate.propose(turned).unwrap_err().contains("not finite"));
+        assert!(invalid(&mut gate, turned).contains("not finite"));
+    }
+
+    #[test]
+    fn a_message_that_is_no_proposal_moves_nothing() {
+        let mut gate = gate();
+        let broken = || Err("proposal 8: x is not finite".to_owned());
+        assert!(matches!(gate.propose(8, broken()), Proposed::Invalid(_)));
+        assert_eq!(gate.propose(8, broken()), Proposed::Repeated);
+        let verdict = approve(&mut gate, 8);
+        assert_refused(&gate, verdict, &["x is not finite"]);
     }
 
     #[test]
@@ -633,7 +661,7 @@ mod tests {
             let mut gate = gate();
             let mut fast = proposal(8);
             fast.settings.carry_m_s = bad;
-            assert!(gate.propose(fast).is_err());
+            invalid(&mut gate, fast);
             let verdict = approve(&mut gate, 8);
             assert_refused(&gate, verdict, &["8", "carry_m_s"]);
         }
@@ -644,7 +672,7 @@ mod tests {
         let mut gate = gate();
         let mut elsewhere = proposal(8);
         elsewhere.frame = "front_camera".into();
-        gate.propose(elsewhere).unwrap_err();
+        invalid(&mut gate, elsewhere);
         let verdict = approve(&mut gate, 8);
         assert_refused(&gate, verdict, &["front_camera", "world"]);
     }
@@ -654,11 +682,7 @@ mod tests {
         let mut gate = gate();
         let mut other = proposal(7);
         other.action.place.translation.y = 0.1;
-        assert!(
-            gate.propose(other)
-                .unwrap_err()
-                .contains("different contents")
-        );
+        assert!(invalid(&mut gate, other).contains("different contents"));
         let verdict = approve(&mut gate, 7);
         assert_refused(&gate, verdict, &["7", "different contents"]);
     }
@@ -682,7 +706,7 @@ mod tests {
         let mut gate = gate();
         let mut early = proposal(8);
         early.stamp = Duration::from_secs(6);
-        gate.propose(early).unwrap();
+        assert_eq!(gate.propose(8, Ok(early)), Proposed::Open);
         let verdict = approve(&mut gate, 8);
         assert!(
             matches!(&verdict, Verdict::Wait(r) if r.contains("6.000 s")),
@@ -697,7 +721,7 @@ mod tests {
         let mut gate = gate();
         assert!(matches!(approve(&mut gate, 7), Verdict::Move(_)));
         gate.finish(Duration::from_secs(9));
-        gate.propose(proposal(8)).unwrap();
+        assert_eq!(gate.propose(8, Ok(proposal(8))), Proposed::Open);
         let verdict = approve(&mut gate, 8);
         assert_refused(&gate, verdict, &["8", "5.000 s", "9.000 s"]);
     }
@@ -767,7 +791,7 @@ mod tests {
     fn memory_is_bounded() {
         let mut gate = gate();
         for id in 0..10_000 {
-            let _ = gate.propose(proposal(id));
+            gate.propose(id, Ok(proposal(id)));
             gate.observe(Duration::from_millis(id), Heightmap::new(Workspace::RAVENS));
         }
         assert_eq!(gate.fates.len(), PROPOSALS);

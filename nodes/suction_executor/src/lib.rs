@@ -1,4 +1,14 @@
 //! Node that executes approved proposals through the UR driver interface.
+//!
+//! [`gate`] decides what may move, without middleware; the rest moves it through the driver's own
+//! topics, service and actions, and reports.
 
-mod gate;
-mod status;
+mod driver;
+pub mod gate;
+mod node;
+mod parameters;
+mod rehearsal;
+pub mod status;
+
+pub use node::run;
+pub use parameters::{Driver, Limits, SuctionExecutorParameters};

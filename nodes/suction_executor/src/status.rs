@@ -2,6 +2,8 @@
 
 use std::time::Duration;
 
+use msgs::convert::{self, ConvertError};
+use msgs::sensor_msgs::JointState;
 use ur5::Joints;
 
 /// `ur_dashboard_msgs/RobotMode`: the only mode in which the arm moves.
@@ -17,11 +19,39 @@ pub struct JointReading {
     pub stamp: Duration,
     /// Positions.
     pub positions_rad: Joints,
-    /// Velocities.
+    /// Velocities; zero where the driver gives none.
     pub velocities_rad_s: Joints,
 }
 
-/// The newest status of the driver. Times of arrival are monotonic and from any origin.
+/// The pins that the executor looks at.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Pins {
+    /// Output that switches suction.
+    pub suction: bool,
+    /// Input of the vacuum sensor.
+    pub vacuum: bool,
+}
+
+/// A state that the driver streams.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Newest<T> {
+    /// The newest value.
+    pub value: T,
+    /// When it arrived: monotonic, from any origin.
+    pub at: Duration,
+    /// How many have arrived.
+    pub count: u64,
+}
+
+impl<T> Newest<T> {
+    /// The stream after one more value.
+    pub fn next(before: Option<&Self>, value: T, at: Duration) -> Self {
+        let count = before.map_or(1, |before| before.count + 1);
+        Self { value, at, count }
+    }
+}
+
+/// The newest status of the driver.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct DriverStatus {
     /// `robot_mode`; the driver latches it and publishes changes only.
@@ -30,10 +60,73 @@ pub struct DriverStatus {
     pub safety_mode: Option<u8>,
     /// `robot_program_running`, latched.
     pub program_running: Option<bool>,
-    /// Newest joint state and when it arrived.
-    pub joints: Option<(JointReading, Duration)>,
-    /// When the newest state of the pins arrived.
-    pub io_states: Option<Duration>,
+    /// `joint_states`
+    pub joints: Option<Newest<JointReading>>,
+    /// Since when the joints have stood still.
+    pub still: Option<Still>,
+    /// `io_states`
+    pub pins: Option<Newest<Pins>>,
+}
+
+/// A run of joint readings at the same place.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Still {
+    /// Arrival of the first.
+    pub since: Duration,
+    /// The last two have the same stamp: simulated time stands still, too.
+    pub in_time: bool,
+}
+
+/// What counts as standing still.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct StillRule {
+    /// No joint is faster.
+    pub speed_rad_s: f64,
+    /// No joint moves further from one reading to the next.
+    pub step_rad: f64,
+}
+
+impl JointReading {
+    /// Reads a message, which may name the joints in any order, and others beside.
+    pub fn from_msg(message: &JointState, names: &[String; 6]) -> Result<Self, ConvertError> {
+        let velocities_rad_s = if message.velocity.is_empty() {
+            Joints::zeros()
+        } else {
+            let speeds = JointState {
+                name: message.name.clone(),
+                position: message.velocity.clone(),
+                ..Default::default()
+            };
+            convert::joints_from_msg(&speeds, names)?
+        };
+        Ok(Self {
+            stamp: convert::time_from_msg(&message.header.stamp)?,
+            positions_rad: convert::joints_from_msg(message, names)?,
+            velocities_rad_s,
+        })
+    }
+}
+
+impl DriverStatus {
+    /// Takes the next reading of the joints.
+    pub fn read_joints(&mut self, reading: JointReading, at: Duration, rule: &StillRule) {
+        let before = self.joints.as_ref();
+        let still = before.is_some_and(|before| {
+            let step = reading.positions_rad - before.value.positions_rad;
+            reading.velocities_rad_s.amax() <= rule.speed_rad_s && step.amax() <= rule.step_rad
+        });
+        let in_time = before.is_some_and(|before| before.value.stamp == reading.stamp);
+        self.still = still.then(|| Still {
+            since: self.still.map_or(at, |still| still.since),
+            in_time,
+        });
+        self.joints = Some(Newest::next(before, reading, at));
+    }
+
+    /// Takes the next state of the pins.
+    pub fn read_pins(&mut self, pins: Pins, at: Duration) {
+        self.pins = Some(Newest::next(self.pins.as_ref(), pins, at));
+    }
 }
 
 impl DriverStatus {
@@ -66,8 +159,8 @@ impl DriverStatus {
             None => return Some("the driver has not said whether its program runs".into()),
         }
         let arrivals = [
-            ("joint_states", self.joints.map(|(_, at)| at)),
-            ("io_states", self.io_states),
+            ("joint_states", self.joints.map(|joints| joints.at)),
+            ("io_states", self.pins.map(|pins| pins.at)),
         ];
         for (topic, at) in arrivals {
             let Some(at) = at else {
@@ -120,8 +213,17 @@ pub(crate) mod tests {
             robot_mode: Some(RUNNING),
             safety_mode: Some(NORMAL),
             program_running: Some(true),
-            joints: Some((reading, now)),
-            io_states: Some(now),
+            joints: Some(Newest {
+                value: reading,
+                at: now,
+                count: 1,
+            }),
+            still: None,
+            pins: Some(Newest {
+                value: Pins::default(),
+                at: now,
+                count: 1,
+            }),
         }
     }
 
@@ -131,8 +233,13 @@ pub(crate) mod tests {
         assert_eq!(status.obstacle(Duration::from_secs(11), AGE), None);
         let reason = status.obstacle(Duration::from_millis(11_001), AGE).unwrap();
         assert!(reason.contains("joint_states"), "{reason}");
+        let pins = Newest {
+            value: Pins::default(),
+            at: Duration::from_secs(8),
+            count: 1,
+        };
         let silent_pins = DriverStatus {
-            io_states: Some(Duration::from_secs(8)),
+            pins: Some(pins),
             ..status
         };
         let reason = silent_pins.obstacle(Duration::from_secs(10), AGE).unwrap();
@@ -202,7 +309,7 @@ pub(crate) mod tests {
             ),
             (
                 DriverStatus {
-                    io_states: None,
+                    pins: None,
                     ..ready.clone()
                 },
                 "io_states",
@@ -217,5 +324,60 @@ pub(crate) mod tests {
             ..ready
         };
         assert_eq!(reduced.obstacle(now, AGE), None);
+    }
+
+    #[test]
+    fn joints_stand_still_when_neither_speed_nor_position_says_otherwise() {
+        let rule = StillRule {
+            speed_rad_s: 1e-3,
+            step_rad: 1e-4,
+        };
+        let mut status = DriverStatus::default();
+        let mut read = |at, stamp, position, speed| {
+            let reading = JointReading {
+                stamp: Duration::from_millis(stamp),
+                positions_rad: Joints::repeat(position),
+                velocities_rad_s: Joints::repeat(speed),
+            };
+            status.read_joints(reading, Duration::from_millis(at), &rule);
+            status
+                .still
+                .map(|still| (still.since.as_millis(), still.in_time))
+        };
+        assert_eq!(read(0, 100, 1.0, 0.0), None);
+        assert_eq!(read(1, 108, 1.0, 0.0), Some((1, false)));
+        assert_eq!(read(2, 116, 1.00005, 0.0), Some((1, false)));
+        assert_eq!(read(3, 116, 1.00005, 0.0), Some((1, true)));
+        assert_eq!(read(4, 124, 1.00005, 0.01), None);
+        assert_eq!(read(5, 132, 1.1, 0.0), None);
+        assert_eq!(read(6, 132, 1.1, 0.0), Some((6, true)));
+        assert_eq!(status.joints.unwrap().count, 7);
+    }
+
+    #[test]
+    fn joints_are_read_by_name() {
+        let names = ["a", "b", "c", "d", "e", "f"].map(String::from);
+        let mut message = JointState {
+            name: ["gripper", "f", "e", "d", "c", "b", "a"]
+                .map(String::from)
+                .to_vec(),
+            position: vec![9.0, 6.0, 5.0, 4.0, 3.0, 2.0, 1.0],
+            velocity: vec![0.9, 0.6, 0.5, 0.4, 0.3, 0.2, 0.1],
+            ..Default::default()
+        };
+        let reading = JointReading::from_msg(&message, &names).unwrap();
+        assert_eq!(
+            reading.positions_rad,
+            Joints::new(1.0, 2.0, 3.0, 4.0, 5.0, 6.0)
+        );
+        assert_eq!(
+            reading.velocities_rad_s,
+            Joints::new(0.1, 0.2, 0.3, 0.4, 0.5, 0.6)
+        );
+        message.velocity.clear();
+        let reading = JointReading::from_msg(&message, &names).unwrap();
+        assert_eq!(reading.velocities_rad_s, Joints::zeros());
+        message.name.pop();
+        assert!(JointReading::from_msg(&message, &names).is_err());
     }
 }

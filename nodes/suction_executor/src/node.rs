@@ -1,0 +1,516 @@
+//! Topics in, motion and results out.
+
+use std::collections::VecDeque;
+use std::path::Path;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use anyhow::Context as _;
+use heightmap::Workspace;
+use msgs::convert::{self, ConvertError};
+use msgs::sctn_msgs;
+use msgs::sensor_msgs::JointState;
+use msgs::std_msgs::Bool;
+use msgs::ur_dashboard_msgs::{RobotMode, SafetyMode};
+use msgs::ur_msgs::{Digital, IOStates};
+use node_kit::{Level, Node, Publisher, Qos, Subscription};
+use pick_place::{ExecuteError, Outcome, Phase};
+use tokio::runtime::Handle;
+use tokio::sync::watch;
+use tokio::task::JoinHandle;
+use tokio_util::sync::CancellationToken;
+use tracing::{error, info, warn};
+use ur5::WorkCell;
+
+use crate::driver::{DriverError, DriverRobot, Link};
+use crate::gate::{Answer, Decision, Gate, Proposal, Proposed, Rules, Verdict};
+use crate::parameters::{Driver, SuctionExecutorParameters};
+use crate::rehearsal::rehearse;
+use crate::status::{DriverStatus, JointReading, Pins, StillRule};
+
+/// Confirmations that wait for their proposal; more are refused at once.
+const WAITING_CONFIRMATIONS: usize = 16;
+/// Joints move less than this from one reading to the next while they stand still: the noise of
+/// encoders.
+const STILL_STEP_RAD: f64 = 1e-4;
+/// How long a motion may take to stop at shutdown.
+const SHUTDOWN_GRACE: Duration = Duration::from_millis(1500);
+const DIAGNOSTICS_PERIOD: Duration = Duration::from_millis(500);
+
+/// Runs the node until shutdown.
+pub async fn run(node: Node, parameters: SuctionExecutorParameters) -> anyhow::Result<()> {
+    let work_cell = match parameters.urdf.as_path() {
+        path if path == Path::new("") => WorkCell::builtin(),
+        path => WorkCell::load(path),
+    }
+    .context("parameter urdf")?;
+    let origin = Instant::now();
+    let status = follow_status(&node, &parameters.driver, &work_cell.joint_names, origin)?;
+    let link = Link::new(
+        &node,
+        &parameters.driver,
+        &work_cell.joint_names,
+        status.clone(),
+        origin,
+    )?;
+    let rules = Rules {
+        frame: parameters.world_frame.clone(),
+        workspace: Workspace::RAVENS,
+        most: parameters.limits.settings(),
+        observation_tolerance_m: parameters.observation_tolerance_m as f32,
+        observation_changed_fraction: parameters.observation_changed_fraction,
+        status_max_age: Duration::from_secs_f64(parameters.driver.status_max_age_s),
+    };
+    let executor = Executor {
+        proposals: node.subscription("pick_place", Qos::Event)?,
+        confirmations: node.subscription("step_confirmation", Qos::Event)?,
+        heightmaps: node.subscription("heightmap", Qos::Latched)?,
+        results: node.publisher("step_result", Qos::Event)?,
+        gate: Gate::new(rules),
+        automatic: !parameters.require_approval,
+        waiting: VecDeque::new(),
+        motion: None,
+        link: Arc::new(link),
+        node,
+        parameters,
+        work_cell,
+        status,
+        origin,
+    };
+    executor.run().await
+}
+
+/// Keeps the newest status of the driver.
+fn follow_status(
+    node: &Node,
+    driver: &Driver,
+    joint_names: &[String; 6],
+    origin: Instant,
+) -> anyhow::Result<watch::Receiver<DriverStatus>> {
+    let topic = |name| format!("{}/{name}", driver.io_and_status);
+    let mut joint_states = node.subscription::<JointState>("joint_states", Qos::Event)?;
+    let mut io_states = node.subscription::<IOStates>(&topic("io_states"), Qos::Event)?;
+    let mut robot_modes = node.subscription::<RobotMode>(&topic("robot_mode"), Qos::Latched)?;
+    let mut safety_modes = node.subscription::<SafetyMode>(&topic("safety_mode"), Qos::Latched)?;
+    let mut running = node.subscription::<Bool>(&topic("robot_program_running"), Qos::Latched)?;
+    let joint_names = joint_names.clone();
+    let (suction_pin, vacuum_pin) = (driver.suction_pin, driver.vacuum_pin);
+    let rule = StillRule {
+        speed_rad_s: driver.rest_speed_rad_s,
+        step_rad: STILL_STEP_RAD,
+    };
+    let (sender, receiver) = watch::channel(DriverStatus::default());
+    node.spawn(async move {
+        loop {
+            tokio::select! {
+                message = joint_states.recv() => match JointReading::from_msg(&message, &joint_names) {
+                    Ok(reading) => sender.send_modify(|status| {
+                        status.read_joints(reading, origin.elapsed(), &rule);
+                    }),
+                    Err(error) => joint_states.reject(error),
+                },
+                message = io_states.recv() => {
+                    let suction = level(&message.digital_out_states, suction_pin);
+                    let vacuum = level(&message.digital_in_states, vacuum_pin);
+                    match (suction, vacuum) {
+                        (Some(suction), Some(vacuum)) => sender.send_modify(|status| {
+                            status.read_pins(Pins { suction, vacuum }, origin.elapsed());
+                        }),
+                        _ => io_states.reject(format_args!(
+                            "expected digital_out_states of pin {suction_pin} and digital_in_states of pin {vacuum_pin}"
+                        )),
+                    }
+                }
+                message = robot_modes.recv() => {
+                    sender.send_modify(|status| status.robot_mode = Some(message.mode));
+                }
+                message = safety_modes.recv() => {
+                    sender.send_modify(|status| status.safety_mode = Some(message.mode));
+                }
+                message = running.recv() => {
+                    sender.send_modify(|status| status.program_running = Some(message.data));
+                }
+            }
+        }
+    });
+    Ok(receiver)
+}
+
+fn level(states: &[Digital], pin: u8) -> Option<bool> {
+    states
+        .iter()
+        .find(|state| state.pin == pin)
+        .map(|state| state.state)
+}
+
+/// A confirmation that may be ahead of what it speaks of.
+struct Waiting {
+    id: u64,
+    decision: Decision,
+    until: Instant,
+}
+
+/// A primitive under way.
+struct Motion {
+    id: u64,
+    stop: CancellationToken,
+    task: JoinHandle<Ended>,
+}
+
+/// How a primitive ended.
+struct Ended {
+    result: Result<Outcome, ExecuteError<DriverError>>,
+    /// Stamps of the first and the last joint reading.
+    stamps: Option<(Duration, Duration)>,
+}
+
+struct Executor {
+    node: Node,
+    parameters: SuctionExecutorParameters,
+    work_cell: WorkCell,
+    proposals: Subscription<sctn_msgs::PickPlace>,
+    confirmations: Subscription<sctn_msgs::StepConfirmation>,
+    heightmaps: Subscription<sctn_msgs::Heightmap>,
+    results: Publisher<sctn_msgs::StepResult>,
+    gate: Gate,
+    /// Whether new proposals move by themselves.
+    automatic: bool,
+    waiting: VecDeque<Waiting>,
+    motion: Option<Motion>,
+    link: Arc<Link>,
+    status: watch::Receiver<DriverStatus>,
+    origin: Instant,
+}
+
+impl Executor {
+    async fn run(mut self) -> anyhow::Result<()> {
+        let node = self.node.clone();
+        let mut diagnostics = tokio::time::interval(DIAGNOSTICS_PERIOD);
+        loop {
+            let deadline = self.waiting.front().map(|waiting| waiting.until);
+            tokio::select! {
+                message = self.heightmaps.recv() => self.on_heightmap(message),
+                message = self.proposals.recv() => self.on_proposal(message),
+                message = self.confirmations.recv() => self.on_confirmation(message),
+                ended = end_of(&mut self.motion) => self.on_end(ended),
+                () = sleep_until(deadline) => self.ask_again(),
+                _ = diagnostics.tick() => self.diagnose(),
+                () = node.shutdown() => break,
+            }
+        }
+        if let Some(motion) = &self.motion {
+            warn!("shutting down while moving: stopping");
+            motion.stop.cancel();
+            if let Ok(ended) = tokio::time::timeout(SHUTDOWN_GRACE, end_of(&mut self.motion)).await
+            {
+                self.on_end(ended);
+            }
+        }
+        Ok(())
+    }
+
+    fn on_heightmap(&mut self, message: sctn_msgs::Heightmap) {
+        let stamp = convert::time_from_msg(&message.header.stamp);
+        let frame_id = message.header.frame_id.clone();
+        if frame_id != self.parameters.world_frame {
+            let expected = &self.parameters.world_frame;
+            self.heightmaps.reject(format_args!(
+                "header.frame_id is `{frame_id}`, expected `{expected}`"
+            ));
+            return;
+        }
+        match stamp.and_then(|stamp| Ok((stamp, convert::heightmap_from_msg(message)?))) {
+            Ok((stamp, heightmap)) => {
+                self.gate.observe(stamp, heightmap);
+                self.ask_again();
+            }
+            Err(error) => self.heightmaps.reject(error),
+        }
+    }
+
+    fn on_proposal(&mut self, message: sctn_msgs::PickPlace) {
+        let id = message.id;
+        let proposal = read_proposal(&message).map_err(|error| format!("proposal {id}: {error}"));
+        match self.gate.propose(id, proposal) {
+            Proposed::Open => {
+                info!("proposal {id}");
+                if self.automatic {
+                    self.confirm(id, Decision::Approve, None);
+                }
+            }
+            Proposed::Repeated => {}
+            Proposed::Invalid(reason) => {
+                self.proposals.reject(&reason);
+                if self.automatic {
+                    self.report(id, sctn_msgs::StepResult::REFUSED, reason, None);
+                }
+            }
+        }
+        self.ask_again();
+    }
+
+    fn on_confirmation(&mut self, message: sctn_msgs::StepConfirmation) {
+        use sctn_msgs::StepConfirmation;
+        // What was sent before it is to be known before it.
+        while let Some(heightmap) = self.heightmaps.try_recv() {
+            self.on_heightmap(heightmap);
+        }
+        while let Some(proposal) = self.proposals.try_recv() {
+            self.on_proposal(proposal);
+        }
+        let id = message.proposal_id;
+        let decision = match message.decision {
+            StepConfirmation::APPROVE => Decision::Approve,
+            StepConfirmation::REJECT => Decision::Reject,
+            StepConfirmation::STOP => Decision::Stop,
+            // For the goal oracle.
+            StepConfirmation::ADVANCE | StepConfirmation::RETRY => return,
+            other => {
+                let reason = format!(
+                    "decision is {other}, expected APPROVE (1), REJECT (2), ADVANCE (3), RETRY (4) or STOP (5)"
+                );
+                self.confirmations.reject(&reason);
+                self.report(id, sctn_msgs::StepResult::REFUSED, reason, None);
+                return;
+            }
+        };
+        info!(
+            "{decision:?} of proposal {id} by `{}`",
+            message.operator_name
+        );
+        if decision == Decision::Approve && !self.parameters.require_approval {
+            self.automatic = true;
+        }
+        self.confirm(id, decision, None);
+    }
+
+    /// Confirmations whose proposal or heightmap was still on its way.
+    fn ask_again(&mut self) {
+        for waiting in std::mem::take(&mut self.waiting) {
+            self.confirm(waiting.id, waiting.decision, Some(waiting.until));
+        }
+    }
+
+    /// `until`: how long it may wait, where it has waited already.
+    fn confirm(&mut self, id: u64, decision: Decision, until: Option<Instant>) {
+        use sctn_msgs::StepResult;
+        if decision == Decision::Stop {
+            // Nothing goes on by itself after a stop.
+            self.automatic = false;
+            for waiting in std::mem::take(&mut self.waiting) {
+                let reason = format!("proposal {}: a stop came before it", waiting.id);
+                self.report(waiting.id, StepResult::REFUSED, reason, None);
+            }
+        }
+        let arm = &self.work_cell.arm;
+        let verdict = self.gate.confirm(
+            id,
+            decision,
+            &self.status.borrow(),
+            self.origin.elapsed(),
+            |status, proposal| rehearse(arm, status, proposal),
+        );
+        match verdict {
+            Verdict::Move(proposal) => self.begin(*proposal),
+            Verdict::Cancel => {
+                if let Some(motion) = &self.motion {
+                    motion.stop.cancel();
+                }
+            }
+            Verdict::Answer(answer, reason) => {
+                let outcome = match answer {
+                    Answer::Refused => StepResult::REFUSED,
+                    Answer::Rejected => StepResult::REJECTED,
+                    Answer::Stopped => StepResult::STOPPED,
+                };
+                self.report(id, outcome, reason, None);
+            }
+            Verdict::Wait(reason) => {
+                let grace = Duration::from_secs_f64(self.parameters.confirmation_grace_s);
+                let until = until.unwrap_or_else(|| Instant::now() + grace);
+                if Instant::now() >= until || self.waiting.len() >= WAITING_CONFIRMATIONS {
+                    self.report(id, StepResult::REFUSED, reason, None);
+                } else {
+                    self.waiting.push_back(Waiting {
+                        id,
+                        decision,
+                        until,
+                    });
+                }
+            }
+            Verdict::Nothing => {}
+        }
+    }
+
+    fn begin(&mut self, proposal: Proposal) {
+        info!("proposal {}: moving", proposal.id);
+        let stop = CancellationToken::new();
+        let mut robot = DriverRobot::new(Arc::clone(&self.link), Handle::current(), stop.clone());
+        let arm = self.work_cell.arm.clone();
+        let diagnostics = self.node.diagnostics().clone();
+        let id = proposal.id;
+        let observe = move |phase: Phase| {
+            let values = [("proposal_id", id.to_string())];
+            diagnostics.set("motion", Level::Ok, format!("{phase:?}"), values);
+        };
+        let task = self.node.spawn_blocking(move || {
+            let Proposal {
+                action, settings, ..
+            } = &proposal;
+            let result = pick_place::execute(&mut robot, &arm, action, settings, observe);
+            Ended {
+                result,
+                stamps: robot.stamps,
+            }
+        });
+        self.motion = Some(Motion { id, stop, task });
+    }
+
+    fn on_end(&mut self, (id, stopped, ended): (u64, bool, anyhow::Result<Ended>)) {
+        use sctn_msgs::StepResult;
+        let (result, stamps) = match ended {
+            Ok(ended) => (Ok(ended.result), ended.stamps),
+            Err(error) => (Err(error), None),
+        };
+        let (outcome, mut reason) = match result {
+            Ok(Ok(outcome)) => (convert::outcome_to_msg(outcome), why(outcome).to_owned()),
+            Ok(Err(ExecuteError::Robot {
+                phase,
+                error: DriverError::Stopped,
+            })) => (
+                StepResult::STOPPED,
+                format!("{phase:?}: {}", DriverError::Stopped),
+            ),
+            Ok(Err(error)) => (StepResult::FAULT, one_line(&error.to_string())),
+            Err(error) => (StepResult::FAULT, format!("{error:#}")),
+        };
+        let broken_off = matches!(outcome, StepResult::STOPPED | StepResult::FAULT);
+        let values = [("proposal_id", id.to_string())];
+        let level = if outcome == StepResult::FAULT {
+            Level::Error
+        } else {
+            Level::Ok
+        };
+        if broken_off {
+            // Nothing goes on by itself.
+            self.automatic = false;
+            reason += "; the arm stands where it is, suction is as it was; a new observation and approval are needed";
+        } else if stopped {
+            reason = format!("the stop came after the end. {reason}")
+                .trim()
+                .to_owned();
+        }
+        self.node
+            .diagnostics()
+            .set("motion", level, &reason, values);
+        // Observations from then on show the result. Simulated time may still be on its way.
+        let now = Duration::from_nanos(self.node.clock().now_ns().max(0) as u64);
+        let end = stamps.map_or(now, |(_, last)| last.max(now));
+        let duration = stamps.map_or(Duration::ZERO, |(first, last)| last - first.min(last));
+        self.gate.finish(end);
+        self.report(id, outcome, reason, Some((end, duration)));
+        self.ask_again();
+    }
+
+    /// `motion`: when it ended and how long it took.
+    fn report(&self, id: u64, outcome: u8, reason: String, motion: Option<(Duration, Duration)>) {
+        use sctn_msgs::StepResult;
+        match outcome {
+            StepResult::PLACED | StepResult::REJECTED => {
+                info!("proposal {id}: {}. {reason}", name(outcome))
+            }
+            StepResult::FAULT => error!("proposal {id}: {}: {reason}", name(outcome)),
+            _ => warn!("proposal {id}: {}: {reason}", name(outcome)),
+        }
+        let (end, duration) = match motion {
+            Some((end, duration)) => (convert::time_to_msg(end).ok(), duration),
+            None => (None, Duration::ZERO),
+        };
+        self.results.publish(StepResult {
+            header: msgs::std_msgs::Header {
+                stamp: end.unwrap_or_else(|| self.node.now()),
+                frame_id: self.parameters.world_frame.clone(),
+            },
+            proposal_id: id,
+            outcome,
+            reason,
+            duration: convert::duration_to_msg(duration).unwrap_or_default(),
+        });
+    }
+
+    fn diagnose(&self) {
+        let max_age = Duration::from_secs_f64(self.parameters.driver.status_max_age_s);
+        let obstacle = self
+            .status
+            .borrow()
+            .obstacle(self.origin.elapsed(), max_age);
+        let (level, message) = match obstacle {
+            None => (Level::Ok, "ready".to_owned()),
+            Some(obstacle) => (Level::Warn, obstacle),
+        };
+        self.node.diagnostics().set("driver", level, message, []);
+    }
+}
+
+/// Waits for the end of a motion, and takes it; for ever when there is none.
+async fn end_of(motion: &mut Option<Motion>) -> (u64, bool, anyhow::Result<Ended>) {
+    match motion {
+        Some(running) => {
+            let ended = (&mut running.task)
+                .await
+                .context("the motion's thread panicked");
+            let (id, stopped) = (running.id, running.stop.is_cancelled());
+            *motion = None;
+            (id, stopped, ended)
+        }
+        None => std::future::pending().await,
+    }
+}
+
+async fn sleep_until(deadline: Option<Instant>) {
+    match deadline {
+        Some(deadline) => tokio::time::sleep_until(deadline.into()).await,
+        None => std::future::pending().await,
+    }
+}
+
+fn read_proposal(message: &sctn_msgs::PickPlace) -> Result<Proposal, ConvertError> {
+    Ok(Proposal {
+        id: message.id,
+        frame: message.header.frame_id.clone(),
+        stamp: convert::time_from_msg(&message.header.stamp)?,
+        action: convert::pick_place_from_msg(message)?,
+        settings: convert::settings_from_msg(&message.settings)?,
+    })
+}
+
+fn why(outcome: Outcome) -> &'static str {
+    match outcome {
+        Outcome::Placed => "",
+        Outcome::NoContact => "the descent met nothing to pick",
+        Outcome::GraspFailed => "suction held nothing",
+        Outcome::Dropped => "the object was lost on the way",
+        Outcome::LagAborted => "the tip lagged too far behind; the object was released",
+    }
+}
+
+fn name(outcome: u8) -> &'static str {
+    use sctn_msgs::StepResult;
+    match outcome {
+        StepResult::PLACED => "PLACED",
+        StepResult::NO_CONTACT => "NO_CONTACT",
+        StepResult::GRASP_FAILED => "GRASP_FAILED",
+        StepResult::DROPPED => "DROPPED",
+        StepResult::LAG_ABORTED => "LAG_ABORTED",
+        StepResult::REFUSED => "REFUSED",
+        StepResult::REJECTED => "REJECTED",
+        StepResult::FAULT => "FAULT",
+        StepResult::STOPPED => "STOPPED",
+        _ => "unknown outcome",
+    }
+}
+
+/// Poses print themselves over several lines.
+fn one_line(text: &str) -> String {
+    text.split_whitespace().collect::<Vec<_>>().join(" ")
+}

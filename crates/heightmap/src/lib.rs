@@ -6,7 +6,7 @@
 
 mod camera;
 mod fusion;
-mod picture;
+pub mod picture;
 mod workspace;
 
 pub use camera::{Camera, CameraError, Intrinsics};

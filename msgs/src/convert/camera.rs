@@ -86,8 +86,8 @@ pub fn color_from_msg(
 }
 
 /// Depth in metres of an image of encoding 16UC1 (millimetres) or 32FC1 (metres), row-major, without padding.
-/// Its size must be that of `expected`. 0 and values that are not finite stand for "nothing measured" (REP-118);
-/// finite negative ones are refused. `depth_m` is overwritten.
+/// Its size must be that of `expected`. 0 and values that are not finite stand for "nothing measured" (REP-118), and
+/// so do negative ones: one odd pixel is no reason to lose a view. `depth_m` is overwritten.
 pub fn depth_from_msg(
     image: &sensor_msgs::Image,
     expected: &Intrinsics,
@@ -125,13 +125,6 @@ pub fn depth_from_msg(
             rows(image, expected, 4)?.for_each(|row| {
                 depth_m.extend(row.as_chunks::<4>().0.iter().map(|&bytes| read(bytes)))
             });
-            if let Some(index) = depth_m
-                .iter()
-                .position(|depth| depth.is_finite() && *depth < 0.0)
-            {
-                let actual = format!("{} m at pixel {index}", depth_m[index]);
-                return Err(unexpected("data", actual, "no negative depth"));
-            }
         }
         other => {
             return Err(unexpected(
@@ -425,8 +418,6 @@ mod tests {
             "step is 5, expected at least 6 for 2 pixels"
         );
         refusal(padded("rgb8", 0, u32::MAX, &[0; 10]));
-        let negative = padded("32FC1", 0, 8, &(-1.0f32).to_le_bytes().repeat(4));
-        assert!(depth_from_msg(&negative, &CAMERA, &mut Vec::new()).is_err());
     }
 
     #[test]

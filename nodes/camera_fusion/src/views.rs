@@ -309,3 +309,254 @@ impl CameraState {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use msgs::{geometry_msgs::TransformStamped, std_msgs::Header};
+    use nalgebra::{Translation3, UnitQuaternion, Vector3};
+
+    const CAMERA: Intrinsics = Intrinsics {
+        width: 64,
+        height: 48,
+        fx_px: 30.0,
+        fy_px: 30.0,
+        cx_px: 31.5,
+        cy_px: 23.5,
+    };
+
+    fn views() -> Views {
+        let parameters = CameraFusionParameters {
+            cameras: vec!["front".into(), "left".into()],
+            tolerance_s: 0.02,
+            ..CameraFusionParameters::default()
+        };
+        Views::new(&parameters, BTreeMap::new())
+    }
+
+    fn header(stamp: Duration, frame: &str) -> Header {
+        convert::header(stamp, frame).unwrap()
+    }
+
+    /// Cameras a metre above the middle of the table, looking down.
+    fn extrinsics(frames: &[&str]) -> TFMessage {
+        let pose = Isometry3::from_parts(
+            Translation3::new(0.5, 0.0, 1.0),
+            UnitQuaternion::from_axis_angle(&Vector3::x_axis(), std::f64::consts::PI),
+        );
+        TFMessage {
+            transforms: frames
+                .iter()
+                .map(|frame| TransformStamped {
+                    header: header(Duration::ZERO, "world"),
+                    child_frame_id: (*frame).into(),
+                    transform: convert::isometry_to_msg(&pose),
+                })
+                .collect(),
+        }
+    }
+
+    fn color(stamp: Duration, frame: &str) -> Image {
+        let rgb = vec![100; 3 * CAMERA.width * CAMERA.height];
+        convert::color_to_msg(header(stamp, frame), &CAMERA, rgb).unwrap()
+    }
+
+    /// A plane at this height.
+    fn depth(stamp: Duration, frame: &str, height_m: f32) -> Image {
+        let depth_m = vec![1.0 - height_m; CAMERA.width * CAMERA.height];
+        convert::depth_to_msg(header(stamp, frame), &CAMERA, &depth_m).unwrap()
+    }
+
+    fn calibrate(views: &mut Views) {
+        for camera in 0..2 {
+            let info = convert::intrinsics_to_msg(Header::default(), &CAMERA);
+            views.calibrate(camera, &info).unwrap();
+        }
+    }
+
+    fn ready() -> Views {
+        let mut views = views();
+        assert!(views.transform(extrinsics(&["front", "left"])).is_empty());
+        calibrate(&mut views);
+        views
+    }
+
+    fn send(views: &mut Views, camera: usize, stamp_ms: u64) {
+        let frame = ["front", "left"][camera];
+        let stamp = Duration::from_millis(stamp_ms);
+        views
+            .image(camera, Stream::Color, color(stamp, frame))
+            .unwrap();
+        views
+            .image(camera, Stream::Depth, depth(stamp, frame, 0.05))
+            .unwrap();
+    }
+
+    fn fused_stamp_ms(views: &mut Views) -> Option<u128> {
+        let fused = views.fuse().unwrap()?;
+        Some(
+            convert::time_from_msg(&fused.message.header.stamp)
+                .unwrap()
+                .as_millis(),
+        )
+    }
+
+    #[test]
+    fn views_of_one_stamp_become_one_heightmap() {
+        let mut views = ready();
+        send(&mut views, 0, 1000);
+        assert_eq!(views.fuse().unwrap(), None);
+        send(&mut views, 1, 1000);
+        let fused = views.fuse().unwrap().unwrap();
+        assert_eq!(fused.message.views, 2);
+        assert_eq!(fused.message.header.frame_id, "world");
+        assert!(fused.message.coverage > 0.0);
+        let top = fused.message.height_m.iter().copied().fold(0.0, f32::max);
+        assert!((top - 0.05).abs() < 1e-4, "{top}");
+    }
+
+    #[test]
+    fn a_repeated_frame_is_fused_once() {
+        let mut views = ready();
+        for _ in 0..3 {
+            send(&mut views, 0, 1000);
+            send(&mut views, 1, 1000);
+        }
+        assert_eq!(fused_stamp_ms(&mut views), Some(1000));
+        send(&mut views, 0, 1000);
+        send(&mut views, 1, 1000);
+        assert_eq!(fused_stamp_ms(&mut views), None);
+    }
+
+    #[test]
+    fn stamps_within_the_tolerance_match_and_others_do_not() {
+        let mut views = ready();
+        send(&mut views, 0, 1000);
+        send(&mut views, 1, 1021);
+        assert_eq!(fused_stamp_ms(&mut views), None);
+        send(&mut views, 0, 1033);
+        // 1021 and 1033 match; the heightmap has the stamp of its newest view.
+        assert_eq!(fused_stamp_ms(&mut views), Some(1033));
+        send(&mut views, 1, 1020);
+        assert_eq!(fused_stamp_ms(&mut views), None);
+    }
+
+    #[test]
+    fn the_newest_set_is_fused_and_older_ones_are_not() {
+        let mut views = ready();
+        for stamp_ms in [1000, 1100, 1200] {
+            send(&mut views, 0, stamp_ms);
+        }
+        for stamp_ms in [1000, 1200, 1100] {
+            send(&mut views, 1, stamp_ms);
+        }
+        assert_eq!(fused_stamp_ms(&mut views), Some(1200));
+        assert_eq!(fused_stamp_ms(&mut views), None);
+    }
+
+    #[test]
+    fn a_clock_that_is_set_back_starts_anew() {
+        let mut views = ready();
+        send(&mut views, 0, 90_000);
+        send(&mut views, 1, 90_000);
+        assert_eq!(fused_stamp_ms(&mut views), Some(90_000));
+        send(&mut views, 0, 1000);
+        send(&mut views, 1, 1000);
+        assert_eq!(fused_stamp_ms(&mut views), Some(1000));
+    }
+
+    #[test]
+    fn without_extrinsics_the_frame_is_named_and_later_ones_help() {
+        let mut views = views();
+        calibrate(&mut views);
+        views.transform(extrinsics(&["front"]));
+        send(&mut views, 0, 1000);
+        send(&mut views, 1, 1000);
+        let complaints = views.fuse().unwrap_err();
+        assert_eq!((complaints.len(), complaints[0].camera), (1, 1));
+        assert!(complaints[0].reason.contains("\"left\""), "{complaints:?}");
+        views.transform(extrinsics(&["left"]));
+        assert_eq!(fused_stamp_ms(&mut views), Some(1000));
+    }
+
+    #[test]
+    fn a_bad_image_is_complained_about_once_and_the_next_set_is_fused() {
+        let mut views = ready();
+        send(&mut views, 0, 1000);
+        send(&mut views, 1, 1000);
+        let mut truncated = color(Duration::from_millis(1000), "left");
+        truncated.data.truncate(100);
+        views.image(1, Stream::Color, truncated).unwrap();
+        let complaints = views.fuse().unwrap_err();
+        assert_eq!(
+            (complaints[0].camera, complaints[0].stream),
+            (1, Stream::Color)
+        );
+        assert!(complaints[0].reason.contains("data"), "{complaints:?}");
+        assert_eq!(views.fuse().unwrap(), None);
+        send(&mut views, 0, 1100);
+        send(&mut views, 1, 1100);
+        assert_eq!(fused_stamp_ms(&mut views), Some(1100));
+    }
+
+    #[test]
+    fn a_bad_calibration_is_refused_and_nothing_is_fused_until_a_good_one_arrives() {
+        let mut views = ready();
+        let mut info = convert::intrinsics_to_msg(Header::default(), &CAMERA);
+        info.k[0] = 0.0;
+        let complaint = views.calibrate(1, &info).unwrap_err();
+        assert_eq!((complaint.camera, complaint.stream), (1, Stream::Info));
+        send(&mut views, 0, 1000);
+        send(&mut views, 1, 1000);
+        assert_eq!(views.fuse().unwrap_err()[0].stream, Stream::Info);
+        calibrate(&mut views);
+        assert_eq!(fused_stamp_ms(&mut views), Some(1000));
+    }
+
+    #[test]
+    fn holes_in_the_depth_leave_a_finite_heightmap() {
+        let mut views = ready();
+        let stamp = Duration::from_millis(1000);
+        for (camera, frame) in ["front", "left"].into_iter().enumerate() {
+            let mut depth_m = vec![0.9; CAMERA.width * CAMERA.height];
+            for (index, hole) in [f32::NAN, 0.0, f32::INFINITY].into_iter().enumerate() {
+                depth_m[100 + index] = hole;
+            }
+            let depth = convert::depth_to_msg(header(stamp, frame), &CAMERA, &depth_m).unwrap();
+            views.image(camera, Stream::Depth, depth).unwrap();
+            views
+                .image(camera, Stream::Color, color(stamp, frame))
+                .unwrap();
+        }
+        let fused = views.fuse().unwrap().unwrap();
+        assert!(
+            fused
+                .message
+                .height_m
+                .iter()
+                .all(|height| height.is_finite())
+        );
+    }
+
+    #[test]
+    fn a_flood_of_unmatched_images_takes_no_more_memory_than_a_few() {
+        let mut views = ready();
+        for stamp_ms in 0..1000 {
+            send(&mut views, 0, 100 * stamp_ms);
+        }
+        assert!(views.cameras[0].color.len() <= WAITING_IMAGES);
+        assert!(views.cameras[0].depth.len() <= WAITING_IMAGES);
+    }
+
+    #[test]
+    fn a_stamp_that_is_none_is_refused() {
+        let mut views = ready();
+        let mut image = color(Duration::ZERO, "front");
+        image.header.stamp.nanosec = u32::MAX;
+        let complaint = views.image(0, Stream::Color, image).unwrap_err();
+        assert!(
+            complaint.reason.starts_with("header.stamp"),
+            "{complaint:?}"
+        );
+    }
+}

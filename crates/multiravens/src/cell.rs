@@ -255,7 +255,10 @@ impl Cell {
         if let Phase::Moving = motion.phase {
             self.joints = motion.trajectory.sample(elapsed);
         }
+        let lag_before_m = self.world.lag_m();
         self.step()?;
+        // A tip that was let go of catches up: that is no reason to stop.
+        let lag_m = self.world.lag_m();
         let ended = match &mut motion.phase {
             Phase::Settling(rest) => {
                 let over = rest.is_over(&self.world);
@@ -263,7 +266,7 @@ impl Cell {
                 over.then_some(MotionEnd::Reached)
             }
             _ if motion.until_contact && self.world.touches() => Some(MotionEnd::Contact),
-            _ if self.world.lag_m() > MAX_LAG_M => Some(MotionEnd::Lag),
+            _ if lag_m > MAX_LAG_M && lag_m >= lag_before_m => Some(MotionEnd::Lag),
             Phase::Moving => {
                 if elapsed >= motion.trajectory.duration() {
                     motion.phase = Phase::CatchingUp(0);
@@ -272,7 +275,7 @@ impl Cell {
             }
             Phase::CatchingUp(waited) => {
                 *waited += 1;
-                let over = self.world.lag_m() < CAUGHT_UP_M || *waited >= CATCH_UP_STEPS;
+                let over = lag_m < CAUGHT_UP_M || *waited >= CATCH_UP_STEPS;
                 if over && self.is_home() && self.world.held().is_none() {
                     motion.phase = Phase::Settling(Rest::default());
                     None

@@ -8,3 +8,9 @@ pub const PLATE: [u8; 3] = [36, 36, 38];
 pub const RED: [u8; 3] = [255, 87, 89];
 /// Blue.
 pub const BLUE: [u8; 3] = [78, 121, 167];
+/// Yellow.
+pub const YELLOW: [u8; 3] = [237, 201, 72];
+/// Grey: beads.
+pub const GREY: [u8; 3] = [186, 176, 172];
+/// Pegs.
+pub const PEG: [u8; 3] = [156, 117, 95];

@@ -1,6 +1,7 @@
 //! Task modules: one file each, one line each in [`REGISTRY`].
 
 mod placing;
+mod routing;
 
 use crate::world::World;
 use nalgebra::{Isometry2, Isometry3, Vector2};
@@ -11,7 +12,10 @@ use serde_yaml_ng::Value;
 use std::fmt;
 
 /// All task modules: the name in problem files, and what reads their parameters.
-pub const REGISTRY: &[(&str, Configure)] = &[("placing", placing::configure)];
+pub const REGISTRY: &[(&str, Configure)] = &[
+    ("placing", placing::configure),
+    ("routing", routing::configure),
+];
 
 /// Reads and checks the `parameters` of a module in a problem file.
 pub type Configure = fn(Value) -> Result<Box<dyn TaskModule>, ParameterError>;

@@ -12,15 +12,18 @@ use rapier3d::prelude::{
     PhysicsWorld, RigidBodyBuilder, RigidBodyHandle, Vector,
 };
 
-/// Half of the width and of the height of the cup, a box because the engine's contacts of boxes
-/// are the steadiest.
-const TIP_HALF_M: (f32, f32) = (0.004, 0.005);
+/// Half of the width and of the length of the tool's end, a box because the engine's contacts of
+/// boxes are the steadiest. Long, or a cable could lie down on top of it.
+const TIP_HALF_M: (f32, f32) = (0.004, 0.035);
 const TIP_MASS_KG: f32 = 0.1;
 const TIP_INERTIA_KG_M2: f32 = 1e-4;
 const STIFFNESS_N_M: f32 = 3158.0;
 const DAMPING_N_S_M: f32 = 50.0;
 /// Force limit while nothing is held.
 const EMPTY_FORCE_N: f32 = 5.0;
+/// A tip pushed this far back into the tool counts as contact, whatever pushes: a held bead may
+/// come down on its own neighbour.
+const PUSHED_BACK_M: f32 = 3e-3;
 /// How far the cup reaches when suction goes on: it may have bounced a little.
 const GRASP_DISTANCE_M: f32 = 1e-3;
 const LINEAR: [JointAxis; 3] = [JointAxis::LinX, JointAxis::LinY, JointAxis::LinZ];
@@ -49,7 +52,7 @@ impl Suction {
             .gravity_scale(0.0)
             // A moving kinematic body does not wake what is joined to it.
             .can_sleep(false);
-        // The cup reaches from the tip's frame back into the tool.
+        // From the tip's frame back into the tool.
         let (half_width, half_height) = TIP_HALF_M;
         let cup = ColliderBuilder::cuboid(half_width, half_width, half_height)
             .translation(Vector::new(0.0, 0.0, -half_height))
@@ -133,8 +136,13 @@ impl World {
     }
 
     /// Whether the tip touches something; while it holds a body, whether that body touches
-    /// anything but the tip and the bodies joined to it.
+    /// anything but the tip and the bodies joined to it, or pushes the tip back.
     pub fn touches(&self) -> bool {
+        let head = self.physics.bodies[self.suction.head].position();
+        let tip = self.physics.bodies[self.suction.tip].position();
+        if head.inv_mul(tip).translation.z < -PUSHED_BACK_M {
+            return true;
+        }
         let (collider, held) = match &self.suction.grip {
             Some(grip) => {
                 let body = &self.bodies[grip.body.0];

@@ -1,0 +1,327 @@
+//! *routing*: a cable of beads round two or three pegs, in turn on either side, then stretched
+//! (paper, appendix).
+//!
+//! The cable's left end is anchored; the cable starts on one side of all pegs. Peg after peg, from
+//! left to right, it has to be led past on the far side, the near side, the far side, and to lie
+//! against the peg. At last the yellow end is drawn to its goal.
+//!
+//! Module frame: the cable runs along +x; the far side is +y, the side on which it starts -y.
+
+use super::{ParameterError, Task, TaskModule, at_height, check_range, read_parameters};
+use crate::colors;
+use crate::world::{BeadChain, BodyId, Mobility, Part, Shape, World};
+use nalgebra::{Isometry2, Isometry3, Point2, Vector2};
+use pick_place::{PickPlace, PrimitiveSettings};
+use rand::RngExt;
+use rand_chacha::ChaCha8Rng;
+use serde::{Deserialize, Serialize};
+use serde_yaml_ng::Value;
+use std::f64::consts::PI;
+
+const PEG_RADIUS_M: f64 = 0.012;
+const PEG_HEIGHT_M: f64 = 0.03;
+/// Where the cable is anchored along x; its other end is drawn as far to the other side as it goes.
+const ANCHOR_X_M: f64 = -0.2;
+/// Distance of the cable's start from the pegs' middle line.
+const START_Y_M: f64 = -0.09;
+/// A bead's centre passes a peg's centre at this distance when it lies against the peg.
+const PASS_M: f64 = PEG_RADIUS_M + BeadChain::BEAD_RADIUS_M;
+/// The demonstrator leaves this much room between a bead and the peg it passes.
+const ROOM_M: f64 = 0.01;
+/// Cable left over when it is stretched.
+const SLACK_M: f64 = 0.012;
+const FOOTPRINT_M: (f64, f64) = (0.46, 0.28);
+/// A bead above this height lies on something.
+const ON_TABLE_M: f64 = 1.5 * BeadChain::BEAD_RADIUS_M;
+
+const SETTINGS: PrimitiveSettings = PrimitiveSettings {
+    clearance_m: 0.12,
+    lift_m: 0.05,
+    travel_m_s: 1.0,
+    carry_m_s: 0.15,
+    descend_m_s: 0.1,
+    acceleration_m_s2: 1.5,
+};
+
+/// Parameters of the module in a problem file.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields, default)]
+struct Parameters {
+    /// Number of pegs, at least and at most.
+    pegs: (usize, usize),
+    /// How far a bead may be from where the cable should pass a peg, and the end from its goal.
+    tolerance_m: f64,
+}
+
+impl Default for Parameters {
+    fn default() -> Self {
+        Self {
+            pegs: (2, 3),
+            tolerance_m: 0.02,
+        }
+    }
+}
+
+/// Reads the module's parameters.
+pub(super) fn configure(parameters: Value) -> Result<Box<dyn TaskModule>, ParameterError> {
+    let parameters: Parameters = read_parameters(parameters)?;
+    check_range("tolerance_m", parameters.tolerance_m, 5e-3, 0.03)?;
+    let (least, most) = parameters.pegs;
+    if !(2..=3).contains(&least) || !(least..=3).contains(&most) {
+        return Err(ParameterError(format!(
+            "pegs is [{least}, {most}], expected two numbers in order, of 2 and 3"
+        )));
+    }
+    Ok(Box::new(Routing { parameters }))
+}
+
+#[derive(Debug)]
+struct Routing {
+    parameters: Parameters,
+}
+
+/// A peg in the module frame, and the side on which the cable has to pass it.
+#[derive(Clone, Copy, Debug)]
+struct Peg {
+    center: Point2<f64>,
+    /// 1: far side (+y), -1: near side.
+    side: f64,
+}
+
+impl Peg {
+    /// Where a bead passes that lies against the peg.
+    fn pass(&self) -> Point2<f64> {
+        self.center + Vector2::new(0.0, self.side * PASS_M)
+    }
+}
+
+struct RoutingTask {
+    anchor: Isometry2<f64>,
+    pegs: Vec<Peg>,
+    cable: BeadChain,
+    /// Goal of the cable's end, in the module frame.
+    end: Point2<f64>,
+    parameters: Parameters,
+}
+
+impl TaskModule for Routing {
+    fn footprint_m(&self) -> Vector2<f64> {
+        Vector2::new(FOOTPRINT_M.0, FOOTPRINT_M.1)
+    }
+
+    fn build(
+        &self,
+        world: &mut World,
+        anchor: &Isometry2<f64>,
+        rng: &mut ChaCha8Rng,
+    ) -> Box<dyn Task> {
+        Box::new(self.draw(world, anchor, rng))
+    }
+}
+
+impl Routing {
+    fn draw(
+        &self,
+        world: &mut World,
+        anchor: &Isometry2<f64>,
+        rng: &mut ChaCha8Rng,
+    ) -> RoutingTask {
+        let (least, most) = self.parameters.pegs;
+        let count = rng.random_range(least..=most);
+        let spacing = if count == 2 { 0.13 } else { 0.1 };
+        let pegs: Vec<_> = (0..count)
+            .map(|index| {
+                let side = if index % 2 == 0 { 1.0 } else { -1.0 };
+                let x = (index as f64 - (count - 1) as f64 / 2.0) * spacing;
+                let x = x + rng.random_range(-0.012..0.012);
+                let y = side * rng.random_range(0.0..0.02);
+                Peg {
+                    center: Point2::new(x, y),
+                    side,
+                }
+            })
+            .collect();
+        for peg in &pegs {
+            world.add(&Part {
+                shape: Shape::Cylinder {
+                    radius_m: PEG_RADIUS_M,
+                    length_m: PEG_HEIGHT_M,
+                },
+                pose: at_height(
+                    &(anchor * Isometry2::from(peg.center.coords)),
+                    PEG_HEIGHT_M / 2.0,
+                ),
+                mobility: Mobility::Fixed,
+                friction: 0.3,
+                rgb: colors::PEG,
+            });
+        }
+        // The taut cable: from the anchor past the pegs to the right, as level as it comes.
+        let start = Point2::new(ANCHOR_X_M, 0.0);
+        let mut taut = vec![start];
+        taut.extend(pegs.iter().map(Peg::pass));
+        let to_last = length(&taut);
+        let last = taut[taut.len() - 1];
+        let reach = Point2::new(rng.random_range(0.17..0.2), 0.0) - last;
+        let beads = ((to_last + reach.norm() + SLACK_M) / BeadChain::PITCH_M).ceil() as usize + 1;
+        let free = (beads - 1) as f64 * BeadChain::PITCH_M - to_last - SLACK_M;
+        let end = last + reach.normalize() * free;
+        let centers: Vec<_> = lay(start, beads)
+            .into_iter()
+            .map(|p| {
+                let p = anchor * p;
+                nalgebra::Point3::new(p.x, p.y, BeadChain::BEAD_RADIUS_M)
+            })
+            .collect();
+        let cable = world.add_bead_chain(&centers, false, true, |index| match index {
+            0 => colors::PEG,
+            i if i + 1 == beads => colors::YELLOW,
+            _ => colors::GREY,
+        });
+        RoutingTask {
+            anchor: *anchor,
+            pegs,
+            cable,
+            end,
+            parameters: self.parameters,
+        }
+    }
+}
+
+/// Length of a polyline.
+fn length(points: &[Point2<f64>]) -> f64 {
+    points
+        .windows(2)
+        .map(|pair| (pair[1] - pair[0]).norm())
+        .sum()
+}
+
+/// Beads at their pitch, from the anchor aslant to the cable's start side and on along x.
+fn lay(start: Point2<f64>, beads: usize) -> Vec<Point2<f64>> {
+    let corner = Point2::new(start.x + 0.05, START_Y_M);
+    let slant = (corner - start).norm();
+    let at = |index: usize| {
+        let along = index as f64 * BeadChain::PITCH_M;
+        if along < slant {
+            start + (corner - start) * (along / slant)
+        } else {
+            corner + Vector2::new(along - slant, 0.0)
+        }
+    };
+    // Cutting the corner shortens one link a little; the solver closes that within a step.
+    (0..beads).map(at).collect()
+}
+
+impl RoutingTask {
+    /// The beads' centres in the module frame, with their heights.
+    fn beads(&self, world: &World) -> Vec<(Point2<f64>, f64)> {
+        let local = |bead: &BodyId| {
+            let p = world.position(*bead);
+            (self.anchor.inverse_transform_point(&p.xy()), p.z)
+        };
+        self.cable.beads.iter().map(local).collect()
+    }
+
+    /// Whether the cable is led past a peg on its side, and lies on the table against it.
+    fn is_routed(&self, peg: &Peg, beads: &[(Point2<f64>, f64)]) -> bool {
+        // Seen from the peg, a cable that passes on the far side sweeps about half a turn
+        // clockwise, on the near side anticlockwise; one that loops round it, or ends before it,
+        // sweeps more or less.
+        let sweep: f64 = beads
+            .windows(2)
+            .map(|pair| {
+                let (a, b) = (pair[0].0 - peg.center, pair[1].0 - peg.center);
+                a.perp(&b).atan2(a.dot(&b))
+            })
+            .sum();
+        let passed = (0.5 * PI..1.75 * PI).contains(&(-peg.side * sweep));
+        let against = beads
+            .iter()
+            .any(|(p, z)| *z < ON_TABLE_M && (p - peg.pass()).norm() < self.parameters.tolerance_m);
+        passed && against
+    }
+
+    fn is_stretched(&self, beads: &[(Point2<f64>, f64)]) -> bool {
+        let end = beads.last();
+        end.is_some_and(|(p, _)| (p - self.end).norm() < self.parameters.tolerance_m)
+    }
+
+    /// Whether the suction cup can come down on a bead: nothing above it, no peg in the way.
+    fn can_pick(&self, index: usize, beads: &[(Point2<f64>, f64)]) -> bool {
+        let (p, z) = beads[index];
+        let free = |(i, (other, height)): (usize, &(Point2<f64>, f64))| {
+            i == index || *height < z + 2e-3 || (other - p).norm() > BeadChain::PITCH_M
+        };
+        let clear = |peg: &Peg| (peg.center - p).norm() > PEG_RADIUS_M + 5e-3;
+        beads.iter().enumerate().all(free) && self.pegs.iter().all(clear)
+    }
+}
+
+impl Task for RoutingTask {
+    fn goal_count(&self) -> usize {
+        self.pegs.len() + 1
+    }
+
+    fn max_steps(&self) -> usize {
+        self.pegs.len() + 4
+    }
+
+    fn settings(&self) -> PrimitiveSettings {
+        SETTINGS
+    }
+
+    fn goal_poses(&self) -> Vec<Isometry3<f64>> {
+        let points = self.pegs.iter().map(Peg::pass).chain([self.end]);
+        let poses = points.map(|p| {
+            let pose = self.anchor * Isometry2::from(p.coords);
+            at_height(&pose, BeadChain::BEAD_RADIUS_M)
+        });
+        poses.collect()
+    }
+
+    /// Pegs count strictly in order, the stretch after all of them.
+    fn reached(&mut self, world: &World) -> usize {
+        let beads = self.beads(world);
+        let routed = self
+            .pegs
+            .iter()
+            .take_while(|peg| self.is_routed(peg, &beads));
+        let routed = routed.count();
+        routed + usize::from(routed == self.pegs.len() && self.is_stretched(&beads))
+    }
+
+    /// Lifts the bead that belongs against the next peg over to its side of the peg; when all pegs
+    /// are passed, draws the end to its goal.
+    fn demonstrate(&mut self, world: &World, rng: &mut ChaCha8Rng) -> Option<PickPlace> {
+        let beads = self.beads(world);
+        let next = self
+            .pegs
+            .iter()
+            .position(|peg| !self.is_routed(peg, &beads));
+        let (bead, goal) = match next {
+            Some(next) => {
+                let mut path = vec![Point2::new(ANCHOR_X_M, 0.0)];
+                path.extend(self.pegs[..next].iter().map(Peg::pass));
+                // While the bead is lifted, the cable behind it has to reach up to it.
+                let peg = self.pegs[next].pass() + Vector2::new(0.0, self.pegs[next].side * ROOM_M);
+                let up = SETTINGS.lift_m.hypot((peg - path[path.len() - 1]).norm());
+                let ideal = ((length(&path) + up) / BeadChain::PITCH_M).ceil() as usize;
+                let ideal = ideal + rng.random_range(0..2);
+                let near = [0, 1, -1, 2, -2, 3].map(|off| ideal.saturating_add_signed(off));
+                let bead = near
+                    .into_iter()
+                    .find(|bead| (1..beads.len()).contains(bead) && self.can_pick(*bead, &beads))?;
+                let peg = &self.pegs[next];
+                (bead, peg.pass() + Vector2::new(0.0, peg.side * ROOM_M))
+            }
+            None if !self.is_stretched(&beads) => (beads.len() - 1, self.end),
+            None => return None,
+        };
+        let noise = Vector2::new(rng.random_range(-1e-3..1e-3), rng.random_range(-1e-3..1e-3));
+        let pose = |p: Point2<f64>| Isometry2::new((self.anchor * p).coords, 0.0);
+        Some(PickPlace {
+            pick: pose(beads[bead].0 + noise),
+            place: pose(goal + noise),
+        })
+    }
+}

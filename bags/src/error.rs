@@ -128,3 +128,22 @@ impl BagError {
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::fs::File;
+    use std::io::BufWriter;
+
+    #[test]
+    fn a_full_disk_is_told_apart() {
+        // Linux's device on which nothing has room.
+        let path = Path::new("/dev/full");
+        let mut writer = mcap::Writer::new(BufWriter::new(File::create(path).unwrap())).unwrap();
+        let error = writer.flush().unwrap_err();
+        assert!(matches!(
+            BagError::mcap(path, error),
+            BagError::DiskFull { .. }
+        ));
+    }
+}

@@ -1,0 +1,331 @@
+//! Bags: what is written is read, and what is no bag says why.
+
+use bags::{BagError, BagReader, BagWriter, Compression, Qos, partial_path};
+use msgs::{description, rosgraph_msgs, std_msgs};
+use proptest::prelude::*;
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+use tempfile::TempDir;
+
+fn folder() -> (TempDir, PathBuf) {
+    let folder = TempDir::new().unwrap();
+    let bag = folder.path().join("run");
+    (folder, bag)
+}
+
+fn text(data: impl Into<String>) -> std_msgs::String {
+    std_msgs::String { data: data.into() }
+}
+
+/// Texts `0` to `count - 1`, one a millisecond, and a clock every tenth.
+fn write(bag: &Path, count: u64, compression: Compression) {
+    let mut writer = BagWriter::create(bag, compression).unwrap();
+    let texts = writer
+        .add::<std_msgs::String>("/chatter", Qos::RELIABLE)
+        .unwrap();
+    let clocks = writer
+        .add::<rosgraph_msgs::Clock>("/clock", Qos::BEST_EFFORT)
+        .unwrap();
+    for index in 0..count {
+        let time = Duration::from_millis(index);
+        writer
+            .write(texts, time, &text(format!("{index}")))
+            .unwrap();
+        if index % 10 == 0 {
+            writer
+                .write(clocks, time, &rosgraph_msgs::Clock::default())
+                .unwrap();
+        }
+        if index % 1000 == 999 {
+            writer.flush().unwrap();
+        }
+    }
+    writer.note("problem", "placing");
+    writer.finish().unwrap();
+}
+
+fn file(bag: &Path) -> PathBuf {
+    bag.join("run_0.mcap")
+}
+
+#[test]
+fn what_is_written_is_read_in_order() {
+    for compression in [Compression::None, Compression::default()] {
+        let (_folder, bag) = folder();
+        write(&bag, 2500, compression);
+        let reader = BagReader::open(&bag).unwrap();
+        let texts: Vec<String> = reader
+            .messages()
+            .map(Result::unwrap)
+            .filter(|message| message.topic.name == "/chatter")
+            .map(|message| message.decode::<std_msgs::String>().unwrap().data)
+            .collect();
+        assert!(
+            texts
+                .iter()
+                .map(|text| text.parse::<u64>().unwrap())
+                .eq(0..2500)
+        );
+        assert_eq!(reader.notes()["problem"], "placing");
+        assert_eq!(
+            reader.span(),
+            Some((Duration::ZERO, Duration::from_millis(2499)))
+        );
+        let counts: Vec<(&str, u64, &str)> = reader
+            .topics()
+            .iter()
+            .map(|topic| {
+                (
+                    topic.name.as_str(),
+                    topic.message_count,
+                    topic.type_name.as_str(),
+                )
+            })
+            .collect();
+        assert_eq!(
+            counts,
+            [
+                ("/chatter", 2500, "std_msgs/msg/String"),
+                ("/clock", 250, "rosgraph_msgs/msg/Clock")
+            ]
+        );
+        assert_eq!(reader.topics()[1].offered, [Qos::BEST_EFFORT]);
+        assert_eq!(
+            reader.topics()[1].definition,
+            description("rosgraph_msgs/msg/Clock")
+                .unwrap()
+                .definition
+                .as_bytes()
+        );
+        // The file alone is a bag, too.
+        assert_eq!(
+            BagReader::open(&file(&bag)).unwrap().messages().count(),
+            2750
+        );
+    }
+}
+
+#[test]
+fn a_topic_and_a_span_of_time_are_found_without_the_rest() {
+    let (_folder, bag) = folder();
+    write(&bag, 5000, Compression::default());
+    let reader = BagReader::open(&bag).unwrap();
+    let (from, until) = (Duration::from_millis(2345), Duration::from_millis(2355));
+    let found = |topics: &[&str]| -> Vec<u128> {
+        let messages = reader
+            .messages_between(topics, from, until)
+            .map(Result::unwrap);
+        messages
+            .map(|message| message.log_time.as_millis())
+            .collect()
+    };
+    assert_eq!(found(&["/chatter"]), (2345..2355).collect::<Vec<_>>());
+    assert_eq!(found(&["/clock"]), [2350]);
+    assert_eq!(found(&[]).len(), 11);
+}
+
+#[test]
+fn an_empty_bag_is_a_bag() {
+    let (_folder, bag) = folder();
+    write(&bag, 0, Compression::default());
+    let reader = BagReader::open(&bag).unwrap();
+    assert_eq!(reader.messages().count(), 0);
+    assert_eq!(reader.span(), None);
+}
+
+#[test]
+fn types_unknown_to_this_program_are_carried() {
+    let (_folder, bag) = folder();
+    let mut writer = BagWriter::create(&bag, Compression::default()).unwrap();
+    let topic = writer
+        .add_raw_topic("/other", "other_msgs/msg/Other", "uint8 a\n", "", &[])
+        .unwrap();
+    writer
+        .write_cdr(
+            topic,
+            Duration::from_nanos(7),
+            Duration::from_nanos(5),
+            &[0, 1, 0, 0, 42],
+        )
+        .unwrap();
+    writer.finish().unwrap();
+    let reader = BagReader::open(&bag).unwrap();
+    let message = reader.messages().next().unwrap().unwrap();
+    assert_eq!(message.data, [0, 1, 0, 0, 42]);
+    assert_eq!(
+        (message.log_time.as_nanos(), message.publish_time.as_nanos()),
+        (7, 5)
+    );
+    assert_eq!(message.topic.definition, b"uint8 a\n");
+    let error = message
+        .decode::<std_msgs::String>()
+        .unwrap_err()
+        .to_string();
+    assert_eq!(
+        error,
+        "topic /other holds other_msgs/msg/Other, expected std_msgs/msg/String"
+    );
+}
+
+#[test]
+fn a_type_that_has_changed_since_is_refused() {
+    let (_folder, bag) = folder();
+    let mut writer = BagWriter::create(&bag, Compression::default()).unwrap();
+    let topic = writer
+        .add_raw_topic(
+            "/a",
+            "std_msgs/msg/String",
+            "string text\n",
+            "RIHS01_00",
+            &[],
+        )
+        .unwrap();
+    writer
+        .write_cdr(
+            topic,
+            Duration::ZERO,
+            Duration::ZERO,
+            &msgs::to_cdr(&text("a")).unwrap(),
+        )
+        .unwrap();
+    writer.finish().unwrap();
+    let message = BagReader::open(&bag)
+        .unwrap()
+        .messages()
+        .next()
+        .unwrap()
+        .unwrap();
+    assert!(matches!(
+        message.decode::<std_msgs::String>(),
+        Err(BagError::Definition { .. })
+    ));
+}
+
+#[test]
+fn a_topic_has_one_type() {
+    let (_folder, bag) = folder();
+    let mut writer = BagWriter::create(&bag, Compression::default()).unwrap();
+    let topic = writer.add::<std_msgs::String>("/a", Qos::RELIABLE).unwrap();
+    assert_eq!(
+        writer.add::<std_msgs::String>("/a", Qos::RELIABLE).unwrap(),
+        topic
+    );
+    let error = writer
+        .add::<std_msgs::Bool>("/a", Qos::RELIABLE)
+        .unwrap_err()
+        .to_string();
+    assert_eq!(
+        error,
+        "topic /a is written as std_msgs/msg/String already, expected std_msgs/msg/Bool"
+    );
+    assert!(matches!(
+        writer.write(topic, Duration::ZERO, &std_msgs::Bool::default()),
+        Err(BagError::Type { .. })
+    ));
+}
+
+#[test]
+fn a_bag_is_never_overwritten_and_a_half_written_one_is_noticed() {
+    let (_folder, bag) = folder();
+    let mut writer = BagWriter::create(&bag, Compression::default()).unwrap();
+    let topic = writer.add::<std_msgs::String>("/a", Qos::RELIABLE).unwrap();
+    writer.write(topic, Duration::ZERO, &text("a")).unwrap();
+    writer.flush().unwrap();
+    assert!(!bag.exists(), "only a finished bag has its name");
+    // As if the process had been killed: neither finish nor drop.
+    std::mem::forget(writer);
+    assert!(matches!(
+        BagWriter::create(&bag, Compression::default()),
+        Err(BagError::HalfWritten { .. })
+    ));
+    assert!(matches!(BagReader::open(&bag), Err(BagError::Io { .. })));
+    let partial = partial_path(&bag);
+    assert!(matches!(
+        BagReader::open(&partial),
+        Err(BagError::NotABag { .. })
+    ));
+    assert!(matches!(
+        BagReader::open(&file(&partial)),
+        Err(BagError::Truncated { .. })
+    ));
+    assert!(BagWriter::discard_partial(&bag).unwrap());
+    assert!(!BagWriter::discard_partial(&bag).unwrap());
+    write(&bag, 1, Compression::default());
+    assert!(matches!(
+        BagWriter::create(&bag, Compression::default()),
+        Err(BagError::Exists { .. })
+    ));
+}
+
+#[test]
+fn everything_up_to_the_last_flush_is_in_the_file_of_a_killed_writer() {
+    let (_folder, bag) = folder();
+    let mut writer = BagWriter::create(&bag, Compression::default()).unwrap();
+    let topic = writer.add::<std_msgs::String>("/a", Qos::RELIABLE).unwrap();
+    for step in 0..3 {
+        writer
+            .write(topic, Duration::from_secs(step), &text("a".repeat(1000)))
+            .unwrap();
+        writer.sync().unwrap();
+    }
+    writer
+        .write(topic, Duration::from_secs(3), &text("not flushed"))
+        .unwrap();
+    std::mem::forget(writer);
+    let bytes = std::fs::read(file(&partial_path(&bag))).unwrap();
+    let options = mcap::read::Options::IgnoreEndMagic.into();
+    let messages = mcap::MessageStream::new_with_options(&bytes, options).unwrap();
+    assert_eq!(messages.take_while(Result::is_ok).count(), 3);
+}
+
+#[test]
+fn what_is_no_bag_says_why() {
+    let (folder, bag) = folder();
+    let refusal = |path: &Path| BagReader::open(path).err().unwrap().to_string();
+    assert!(refusal(&bag).contains("run: No such file"));
+    std::fs::create_dir(&bag).unwrap();
+    assert!(
+        refusal(&bag).ends_with("not a bag: metadata.yaml is missing, expected a finished bag")
+    );
+    std::fs::write(bag.join("metadata.yaml"), "rosbag2_bagfile_information: 3").unwrap();
+    assert!(refusal(&bag).contains("not a bag: metadata.yaml: "));
+    let other = folder.path().join("other.mcap");
+    std::fs::write(&other, "hello").unwrap();
+    assert!(refusal(&other).ends_with("not a bag: the file does not begin as an MCAP file"));
+    std::fs::write(&other, "something longer that is no MCAP file").unwrap();
+    assert!(refusal(&other).ends_with("not a bag: the file does not begin as an MCAP file"));
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(64))]
+
+    #[test]
+    fn a_cut_file_is_refused(cut: prop::sample::Index) {
+        let (_folder, bag) = folder();
+        write(&bag, 50, Compression::default());
+        let bytes = std::fs::read(file(&bag)).unwrap();
+        std::fs::write(file(&bag), &bytes[..cut.index(bytes.len())]).unwrap();
+        let error = BagReader::open(&bag).err().expect("a cut file was opened");
+        let told = matches!(error, BagError::Truncated { .. } | BagError::NotABag { .. });
+        prop_assert!(told, "{error}");
+    }
+
+    #[test]
+    fn a_flipped_bit_never_changes_a_message_silently(at: prop::sample::Index, bit in 0u8..8) {
+        let (_folder, bag) = folder();
+        write(&bag, 50, Compression::default());
+        let mut bytes = std::fs::read(file(&bag)).unwrap();
+        let at = at.index(bytes.len());
+        bytes[at] ^= 1 << bit;
+        let read = |bag: &Path| -> Result<Vec<(String, Duration, Vec<u8>)>, BagError> {
+            let reader = BagReader::open(bag)?;
+            let messages = reader.messages();
+            messages.map(|message| message.map(|message| (message.topic.name.clone(), message.log_time, message.data))).collect()
+        };
+        let before = read(&bag).unwrap();
+        std::fs::write(file(&bag), bytes).unwrap();
+        if let Ok(after) = read(&bag) {
+            prop_assert_eq!(before, after, "byte {}", at);
+        }
+    }
+}

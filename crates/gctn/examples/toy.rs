@@ -1,10 +1,10 @@
-//! Learns the toy (coloured blocks of which the goal shows one elsewhere), and says how well and how fast:
-//! `cargo run --release -p gctn --example toy -- [STEPS]`.
+//! Learns the toy (blocks of which the goal shows one elsewhere), and says how well and how fast:
+//! `cargo run --release -p gctn --example toy -- [STEPS] [bf16]`.
 
 #[path = "../tests/toy/mod.rs"]
 mod toy;
 
-use gctn::{NetworkConfig, Trainer, TrainingConfig};
+use gctn::{NetworkConfig, Precision, Trainer, TrainingConfig};
 use std::time::Instant;
 use toy::Toy;
 
@@ -13,12 +13,20 @@ fn main() -> Result<(), gctn::Error> {
         .nth(1)
         .and_then(|steps| steps.parse().ok())
         .unwrap_or(500);
+    let bf16 = std::env::args()
+        .nth(2)
+        .is_some_and(|precision| precision == "bf16");
     let training = TrainingConfig {
         steps,
+        precision: if bf16 {
+            Precision::Bf16
+        } else {
+            Precision::F32
+        },
         ..TrainingConfig::compact()
     };
-    let scenes: Vec<Toy> = (0..400).map(Toy::new).collect();
-    let held_out: Vec<Toy> = (10_000..10_050).map(Toy::new).collect();
+    let scenes: Vec<Toy> = (0..400).map(|seed| Toy::new(seed, 36)).collect();
+    let held_out: Vec<Toy> = (10_000..10_050).map(|seed| Toy::new(seed, 36)).collect();
     let mut trainer = Trainer::new(&NetworkConfig::compact(), &training)?;
     println!("{} weights", trainer.parameters());
 
@@ -60,8 +68,13 @@ fn main() -> Result<(), gctn::Error> {
     };
     let mut distances: Vec<_> = errors.iter().flatten().map(|(m, _)| *m).collect();
     distances.sort_by(f64::total_cmp);
+    let turned = errors
+        .iter()
+        .flatten()
+        .filter(|(_, rad)| *rad < 0.09)
+        .count();
     println!(
-        "{} scenes: picked {}, placed within 10 mm {}, within 5 mm {}; median {:.1} mm; {:.1} ms a decision",
+        "{} scenes: picked {}, turned right {turned}, placed within 10 mm {}, within 5 mm {}; median {:.1} mm; {:.1} ms a decision",
         errors.len(),
         distances.len(),
         near(0.010),

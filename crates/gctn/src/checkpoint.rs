@@ -30,8 +30,12 @@ const VERSION: &str = "1";
 pub(crate) struct File {
     path: PathBuf,
     bytes: Vec<u8>,
-    metadata: HashMap<String, String>,
+    head: BTreeMap<String, String>,
 }
+
+/// The one key of a file's metadata, whose value is a JSON object of texts: the order of several keys
+/// would differ from file to file.
+const HEAD: &str = "gctn";
 
 impl File {
     /// Reads a file and checks that it is a whole one of the given format and version.
@@ -42,7 +46,7 @@ impl File {
         })?;
         let file = Self {
             path: path.into(),
-            metadata: HashMap::new(),
+            head: BTreeMap::new(),
             bytes,
         };
         let (_, header) = SafeTensors::read_metadata(&file.bytes).map_err(|error| {
@@ -50,8 +54,16 @@ impl File {
         })?;
         SafeTensors::deserialize(&file.bytes)
             .map_err(|error| file.error(format!("a truncated safetensors file: {error}")))?;
-        let metadata = header.metadata().clone().unwrap_or_default();
-        let file = Self { metadata, ..file };
+        let head = header
+            .metadata()
+            .as_ref()
+            .and_then(|metadata| metadata.get(HEAD));
+        let head = head.ok_or_else(|| {
+            file.error(format!("no {HEAD:?} in its metadata: not of this program"))
+        })?;
+        let head = serde_json::from_str(head)
+            .map_err(|error| file.error(format!("{HEAD:?} in its metadata: {error}")))?;
+        let file = Self { head, ..file };
         for (key, expected) in [("format", format), ("version", version)] {
             let actual = file.text(key)?;
             if actual != expected {
@@ -76,20 +88,16 @@ impl File {
         }
     }
 
-    /// A text of the metadata.
+    /// A text of the head.
     pub fn text(&self, key: &str) -> Result<&str, Error> {
-        let text = self.metadata.get(key).map(String::as_str);
-        text.ok_or_else(|| {
-            self.error(format!(
-                "no {key:?} in its metadata, so not made by this program"
-            ))
-        })
+        let text = self.head.get(key).map(String::as_str);
+        text.ok_or_else(|| self.error(format!("no {key:?} in its head")))
     }
 
-    /// A value of the metadata that is JSON.
+    /// A value of the head that is JSON.
     pub fn json<T: serde::de::DeserializeOwned>(&self, key: &str) -> Result<T, Error> {
         serde_json::from_str(self.text(key)?)
-            .map_err(|error| self.error(format!("{key:?} in its metadata: {error}")))
+            .map_err(|error| self.error(format!("{key:?} in its head: {error}")))
     }
 
     /// Fills tensors from those of the same names. Refuses missing, further and misshapen ones, and
@@ -134,12 +142,12 @@ impl File {
     }
 }
 
-/// Writes tensors and metadata, so that the file appears whole or not at all.
+/// Writes tensors and head, so that the file appears whole or not at all.
 pub(crate) fn write(
     path: &Path,
     storage: Storage,
     entries: &[(String, Tensor)],
-    metadata: HashMap<String, String>,
+    head: &BTreeMap<&str, String>,
 ) -> Result<(), Error> {
     let (kind, dtype) = match storage {
         Storage::F32 => (Kind::Float, Dtype::F32),
@@ -173,6 +181,7 @@ pub(crate) fn write(
         .map(|(name, shape, bytes)| Ok((*name, TensorView::new(dtype, shape.clone(), bytes)?)))
         .collect::<Result<_, _>>()
         .map_err(problem)?;
+    let metadata = HashMap::from([(HEAD.to_owned(), json(head))]);
     let bytes = safetensors::serialize(views, Some(metadata)).map_err(problem)?;
     write_whole(path, &bytes).map_err(|source| Error::Io {
         path: path.into(),
@@ -205,12 +214,12 @@ pub(crate) fn save(
     parameters: &Parameters,
     card: &ModelCard,
 ) -> Result<(), Error> {
-    let metadata = metadata(
+    let head = head(
         FORMAT,
         VERSION,
         [("network", json(config)), ("card", json(card))],
     );
-    write(path, storage, &parameters.entries, metadata)
+    write(path, storage, &parameters.entries, &head)
 }
 
 /// Reads the head of a network's file: its configuration and its card.
@@ -219,20 +228,19 @@ pub(crate) fn open(path: &Path) -> Result<(File, NetworkConfig, ModelCard), Erro
     let config: NetworkConfig = file.json("network")?;
     config
         .check()
-        .map_err(|error| file.error(format!("\"network\" in its metadata: {error}")))?;
+        .map_err(|error| file.error(format!("\"network\" in its head: {error}")))?;
     let card = file.json("card")?;
     Ok((file, config, card))
 }
 
-/// Metadata of a file.
-pub(crate) fn metadata<const N: usize>(
+/// Head of a file.
+pub(crate) fn head<'a, const N: usize>(
     format: &str,
     version: &str,
-    texts: [(&str, String); N],
-) -> HashMap<String, String> {
+    texts: [(&'a str, String); N],
+) -> BTreeMap<&'a str, String> {
     let head = [("format", format.into()), ("version", version.into())];
-    let texts = head.into_iter().chain(texts);
-    texts.map(|(key, text)| (key.to_owned(), text)).collect()
+    head.into_iter().chain(texts).collect()
 }
 
 /// A value as JSON.

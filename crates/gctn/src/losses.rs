@@ -172,3 +172,156 @@ pub(crate) fn place_loss(
         }
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::input::{rotation_angle, to_px};
+    use crate::{NetworkConfig, Sample};
+    use heightmap::{Heightmap, Pixel, Workspace};
+    use nalgebra::{Isometry2, Vector2};
+    use rand_chacha::{ChaCha8Rng, rand_core::SeedableRng};
+
+    const HALF: Grid = Grid {
+        rows: 160,
+        cols: 80,
+        stride: 2,
+        window: 25,
+        margin: 12,
+        query_margin: 0,
+        sampling: Interpolation::Bilinear,
+        subcell: true,
+    };
+
+    /// A heightmap with a hook of soft dots at a world pose: its long arm points along the pose's +x, the
+    /// short one along +y.
+    fn hook(pose: &Isometry2<f64>) -> Heightmap {
+        let mut heightmap = Heightmap::new(Workspace::RAVENS);
+        let workspace = heightmap.workspace;
+        let dots = [
+            (0., 0.),
+            (0.02, 0.),
+            (0.04, 0.),
+            (0.055, 0.),
+            (0., 0.02),
+            (0., 0.035),
+        ];
+        let dots = dots.map(|(x, y)| pose * Point2::new(x, y));
+        for row in 0..workspace.rows {
+            for col in 0..workspace.cols {
+                let center = workspace.center(Pixel { row, col });
+                let height = |dot: &Point2<f64>| {
+                    (-(center - dot).norm_squared() / (2.0 * 0.006 * 0.006)).exp()
+                };
+                heightmap.height_m[row * workspace.cols + col] =
+                    dots.iter().map(height).sum::<f64>() as f32;
+            }
+        }
+        heightmap
+    }
+
+    /// What a perfect network would say: query and key features are the heights seen and wanted.
+    fn features(sample: &Sample<'_>) -> Features {
+        let image = |heightmap: &Heightmap| {
+            let heights = Tensor::from_slice(&heightmap.height_m).view([1, 1, 320, 160]);
+            heights.avg_pool2d([2, 2], [2, 2], [0, 0], false, true, None::<i64>)
+        };
+        Features {
+            pick: Tensor::zeros([1, 160, 80], (Kind::Float, tch::Device::Cpu)),
+            query: image(sample.observation),
+            key: image(sample.goal).constant_pad_nd([12; 4]),
+            scale: Tensor::ones([1], (Kind::Float, tch::Device::Cpu)),
+        }
+    }
+
+    #[test]
+    fn with_perfect_features_the_place_map_peaks_at_the_label() {
+        for (rotation, yaw) in [(0, 0.4), (3, -1.0), (9, 2.0), (20, 0.0), (31, 3.0)] {
+            let turn = rotation_angle(rotation, 36);
+            let first = Isometry2::new(Vector2::new(0.40, -0.21), yaw);
+            let then = Isometry2::new(Vector2::new(0.57, 0.183), yaw + turn);
+            let [observation, goal] = [hook(&first), hook(&then)];
+            // Not the hook's corner: the object turns about the pick.
+            let held = Vector2::new(0.012, 0.007);
+            let sample = Sample {
+                observation: &observation,
+                goal: &goal,
+                pick: Isometry2::new((first * Point2::from(held)).coords, 0.1),
+                place: Isometry2::new((then * Point2::from(held)).coords, 0.1 + turn),
+            };
+            let label = Label::of(&NetworkConfig::compact(), 0, &sample).unwrap();
+            assert_eq!(label.rotation, rotation);
+            assert_eq!(label.place_px, to_px(&Workspace::RAVENS, &sample.place));
+            let turns = [(0..36).collect()];
+            let logits = place_logits(&HALF, &features(&sample), &[label.pick_px], &turns, 36);
+            let best = logits.argmax(None, false).int64_value(&[]) as usize;
+            let (index, row, col) = (best / 12800, best / 80 % 160, best % 80);
+            assert_eq!(index, rotation);
+            let found = Point2::new(
+                HALF.coordinate_px(col as f64),
+                HALF.coordinate_px(row as f64),
+            );
+            assert!(
+                (found - label.place_px).amax() <= 1.2,
+                "{found} for {}",
+                label.place_px
+            );
+
+            // The rotation loss looks at the same place the same way: a wrong label costs more.
+            let mut loss = |label: Label| {
+                let mut features = features(&sample);
+                features.scale = Tensor::from_slice(&[10f32]);
+                let mut rng = ChaCha8Rng::seed_from_u64(1);
+                let loss = PlaceLoss::RightAndOneWrong;
+                place_loss(&HALF, loss, 0.7, 36, &features, &[label], &mut rng).double_value(&[])
+            };
+            let right = loss(label);
+            for wrong in [1, 18, 35].map(|by| (rotation + by) % 36) {
+                let wrong = loss(Label {
+                    rotation: wrong,
+                    ..label
+                });
+                assert!(right < wrong, "{right} {wrong}");
+            }
+        }
+    }
+
+    #[test]
+    fn a_target_sums_to_one_and_has_its_mean_at_the_label() {
+        let like = Tensor::zeros([1], (Kind::Double, tch::Device::Cpu));
+        let point = Point2::new(41.3, 100.9);
+        let target = targets(&HALF, 0.7, &[point], &like).squeeze_dim(0);
+        let sum = |tensor: Tensor| tensor.sum(None::<Kind>).double_value(&[]);
+        assert!((sum(target.shallow_clone()) - 1.0).abs() < 1e-12);
+        let cols = Tensor::arange(80, (Kind::Double, tch::Device::Cpu));
+        let rows = Tensor::arange(160, (Kind::Double, tch::Device::Cpu)).unsqueeze(1);
+        let mean = Point2::new(sum(&target * cols), sum(&target * rows))
+            .map(|index| HALF.coordinate_px(index));
+        assert!((mean - point).amax() < 0.01, "{mean}");
+    }
+
+    #[test]
+    fn a_hard_target_is_the_cell_that_holds_the_label() {
+        let like = Tensor::zeros([1], (Kind::Double, tch::Device::Cpu));
+        for (point, cell) in [
+            ([0.0, 0.0], 0),
+            ([1.99, 0.0], 0),
+            ([2.0, 2.0], 81),
+            ([159.9, 319.9], 12799),
+        ] {
+            let target = targets(&HALF, 0.0, &[Point2::from(point)], &like);
+            assert_eq!(
+                target.flatten(0, -1).argmax(None, false).int64_value(&[]),
+                cell
+            );
+            assert_eq!(target.sum(None::<Kind>).double_value(&[]), 1.0);
+        }
+    }
+
+    #[test]
+    fn a_very_narrow_target_is_still_one() {
+        let like = Tensor::zeros([1], (Kind::Double, tch::Device::Cpu));
+        let target = targets(&HALF, 1e-3, &[Point2::new(40.0, 100.0)], &like);
+        assert_eq!(target.sum(None::<Kind>).double_value(&[]), 1.0);
+    }
+}

@@ -272,8 +272,8 @@ impl Trainer {
             ("training", checkpoint::json(&self.config)),
             ("step", self.step.to_string()),
         ];
-        let metadata = checkpoint::metadata(FORMAT, VERSION, texts);
-        checkpoint::write(path, Storage::F32, &self.state(), metadata)
+        let head = checkpoint::head(FORMAT, VERSION, texts);
+        checkpoint::write(path, Storage::F32, &self.state(), &head)
     }
 
     /// Goes on where [`Trainer::save_state`] stopped, bit for bit on the processor with the same number of

@@ -1,4 +1,5 @@
-//! A toy of the real work: coloured square blocks on a grey table, of which the goal shows one elsewhere.
+//! A toy of the real work: square blocks, each with a dark edge, on a grey table; the goal shows one of them
+//! elsewhere and turned.
 #![allow(dead_code)] // Test and example use different parts.
 
 use gctn::{Decision, Sample};
@@ -6,6 +7,7 @@ use heightmap::{Heightmap, Pixel, Workspace};
 use nalgebra::{Isometry2, Point2, Vector2};
 use rand::{Rng, RngExt};
 use rand_chacha::{ChaCha8Rng, rand_core::SeedableRng};
+use std::f64::consts::TAU;
 
 const EDGE_M: f64 = 0.04;
 const COLOURS: [[u8; 3]; 6] = [
@@ -29,8 +31,8 @@ pub struct Toy {
 }
 
 impl Toy {
-    /// Another seed, another scene.
-    pub fn new(seed: u64) -> Self {
+    /// Another seed, another scene. The block is turned by one of `rotations`.
+    pub fn new(seed: u64, rotations: u32) -> Self {
         let rng = &mut ChaCha8Rng::seed_from_u64(seed);
         // Poses apart from each other; the last is the goal's.
         let mut poses: Vec<Isometry2<f64>> = Vec::new();
@@ -40,14 +42,10 @@ impl Toy {
             let far =
                 |pose: &Isometry2<f64>| (pose.translation.vector - position).norm() > 1.6 * EDGE_M;
             if poses.iter().all(far) {
-                poses.push(Isometry2::new(
-                    position,
-                    rng.random_range(0.0..std::f64::consts::TAU),
-                ));
+                poses.push(Isometry2::new(position, rng.random_range(0.0..TAU)));
             }
         }
-        // Blocks look the same after a quarter turn: the goal's turn is the least of the four.
-        let turn = rng.random_range(-4..=4) as f64 * 10f64.to_radians();
+        let turn = TAU * f64::from(rng.random_range(0..rotations)) / f64::from(rotations);
         let block = poses[0];
         let wanted = Isometry2::new(poses[4].translation.vector, block.rotation.angle() + turn);
         let first = rng.random_range(0..COLOURS.len());
@@ -79,8 +77,8 @@ impl Toy {
         }
     }
 
-    /// How far from where the goal shows it the block ends up, and how far turned (at most 45 deg); none
-    /// if it was not picked.
+    /// How far from where the goal shows it the block ends up (m), and how far turned (rad); none if it was
+    /// not picked.
     pub fn error(&self, decision: &Decision) -> Option<(f64, f64)> {
         let pick = Point2::from(decision.pick.translation.vector);
         let held = self.block.inverse_transform_point(&pick);
@@ -89,12 +87,8 @@ impl Toy {
         }
         let moved = decision.place * decision.pick.inverse() * self.block;
         let distance_m = (moved.translation.vector - self.wanted.translation.vector).norm();
-        let quarter = std::f64::consts::FRAC_PI_2;
-        let turn = moved.rotation.rotation_to(&self.wanted.rotation).angle();
-        Some((
-            distance_m,
-            (turn - (turn / quarter).round() * quarter).abs(),
-        ))
+        let turn_rad = moved.rotation.rotation_to(&self.wanted.rotation).angle();
+        Some((distance_m, turn_rad.abs()))
     }
 }
 
@@ -104,11 +98,13 @@ fn render(blocks: &[(Isometry2<f64>, [u8; 3])], rng: &mut impl Rng) -> Heightmap
     for row in 0..workspace.rows {
         for col in 0..workspace.cols {
             let center = workspace.center(Pixel { row, col });
-            let on = blocks.iter().find(|(pose, _)| {
+            let on = blocks.iter().find_map(|(pose, rgb)| {
                 let point = pose.inverse_transform_point(&center);
-                point.x.abs().max(point.y.abs()) <= EDGE_M / 2.0
+                let inside = point.x.abs().max(point.y.abs()) <= EDGE_M / 2.0;
+                let dark = point.x > EDGE_M / 4.0;
+                inside.then(|| rgb.map(|channel| if dark { channel / 4 } else { channel }))
             });
-            let (rgb, height_m) = on.map_or(([120; 3], 0.0), |(_, rgb)| (*rgb, EDGE_M as f32));
+            let (rgb, height_m) = on.map_or(([120; 3], 0.0), |rgb| (rgb, EDGE_M as f32));
             let index = row * workspace.cols + col;
             heightmap.height_m[index] = height_m + rng.random_range(-0.001..0.001);
             for (channel, value) in rgb.into_iter().enumerate() {

@@ -3,7 +3,6 @@
 use crate::sampling::{Sampling, SamplingError};
 use bags::{Demonstration, DemonstrationError};
 use gctn::{GoalConditioning, Sample};
-use heightmap::Heightmap;
 use rand::{Rng, RngExt};
 use std::path::{Path, PathBuf};
 
@@ -197,21 +196,11 @@ impl DataSet {
         };
         let action = &indexed.demonstration.steps[step.index].action;
         Ok(Sample {
-            observation: indexed.observation(step.index),
-            goal: indexed.observation(goal),
+            observation: indexed.demonstration.observation(step.index),
+            goal: indexed.demonstration.observation(goal),
             pick: action.pick,
             place: action.place,
         })
-    }
-}
-
-impl Indexed {
-    /// The observation before a step, or the last one.
-    fn observation(&self, index: usize) -> &Heightmap {
-        let steps = &self.demonstration.steps;
-        steps
-            .get(index)
-            .map_or(&self.demonstration.last, |step| &step.observation)
     }
 }
 
@@ -219,7 +208,7 @@ impl Indexed {
 mod tests {
     use super::*;
     use bags::DemonstrationStep;
-    use heightmap::Workspace;
+    use heightmap::{Heightmap, Workspace};
     use nalgebra::Isometry2;
     use pick_place::{Outcome, PickPlace, PrimitiveSettings};
     use rand::SeedableRng;

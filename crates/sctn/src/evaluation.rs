@@ -98,7 +98,7 @@ pub fn attempt(
     if !shown.complete {
         return Ok(None);
     }
-    let goals: Vec<_> = shown.demonstration.goals().collect();
+    let goals = shown.demonstration.goals();
     let conditioning = policy.config().conditioning;
     let oracle = std::cell::Cell::new(NextStepOracle::new(goals.len()));
     let rollout = roll_out(

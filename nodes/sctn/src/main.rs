@@ -1,3 +1,56 @@
-//! The sctn command.
+//! The sctn command: launches the graph, makes demonstrations, trains, evaluates, draws.
 
-fn main() {}
+mod bench;
+mod demos;
+mod evaluate;
+mod picture;
+mod progress;
+mod root;
+mod train;
+
+use anyhow::Result;
+use clap::{Parser, Subcommand};
+use root::Root;
+use std::path::PathBuf;
+
+#[derive(Parser)]
+#[command(name = "sctn", version, about, max_term_width = 100)]
+struct Arguments {
+    /// Folder that holds config/ and urdf/ [default: the nearest one above the current folder or the program]
+    #[arg(long, global = true)]
+    root: Option<PathBuf>,
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Subcommand)]
+enum Command {
+    /// Time the inner loops
+    Bench(bench::Bench),
+    /// Make demonstrations of a problem, and keep the successful ones as bags
+    Demos(demos::Demos),
+    /// Train a policy on demonstrations, by a recipe
+    Train(train::Train),
+    /// Evaluate a policy on held-out episodes
+    Evaluate(evaluate::Evaluate),
+    /// Draw what the cameras, the fusion, the demonstrator and the policy make of a problem
+    Picture(picture::Picture),
+}
+
+fn main() -> Result<()> {
+    tracing_subscriber::fmt()
+        .with_env_filter(
+            tracing_subscriber::EnvFilter::try_from_default_env().unwrap_or_else(|_| "info".into()),
+        )
+        .with_writer(std::io::stderr)
+        .init();
+    let arguments = Arguments::parse();
+    let root = Root::find(arguments.root)?;
+    match arguments.command {
+        Command::Bench(bench) => bench.run(&root),
+        Command::Demos(demos) => demos.run(&root),
+        Command::Train(train) => train.run(&root),
+        Command::Evaluate(evaluate) => evaluate.run(&root),
+        Command::Picture(picture) => picture.run(&root),
+    }
+}

@@ -1,0 +1,155 @@
+//! Starts the nodes: in this process, or as processes of their own.
+
+use crate::root::Root;
+use anyhow::{Context as _, Result, bail};
+use node_kit::{Context, RosArguments};
+use std::path::{Path, PathBuf};
+use std::process::{ExitStatus, Stdio};
+use tokio::process::{Child, Command};
+use tokio::task::JoinHandle;
+
+/// The nodes and what each is told beside its file in config/.
+pub struct Settings {
+    pub problem: String,
+    pub seed: u64,
+    pub demonstration: PathBuf,
+    pub checkpoint: PathBuf,
+}
+
+const NODES: [&str; 5] = ["sim_workcell", "camera_fusion", "goal_oracle", "gctn_policy", "suction_executor"];
+
+impl Settings {
+    fn parameters(&self, root: &Root, node: &str) -> Vec<(&'static str, String)> {
+        let path = |path: &Path| path.display().to_string();
+        match node {
+            "sim_workcell" => vec![
+                ("problem", self.problem.clone()),
+                ("seed", self.seed.to_string()),
+                ("problems_dir", path(&root.join("config/problems"))),
+                ("urdf", path(&root.join("urdf/workcell.urdf"))),
+            ],
+            "goal_oracle" => vec![("demonstration", path(&self.demonstration))],
+            "gctn_policy" => vec![("checkpoint", path(&self.checkpoint))],
+            "suction_executor" => vec![("urdf", path(&root.join("urdf/workcell.urdf")))],
+            _ => Vec::new(),
+        }
+    }
+
+    /// The command line of a node, as `ros2 run` would give it.
+    fn arguments(&self, root: &Root, node: &str) -> Vec<String> {
+        let file = root.join(format!("config/{node}.yaml"));
+        let mut arguments = vec!["--ros-args".to_owned(), "--params-file".into(), file.display().to_string()];
+        let parameters = self.parameters(root, node);
+        for (name, value) in parameters.iter().chain([&("use_sim_time", (node != "sim_workcell").to_string())]) {
+            arguments.extend(["-p".to_owned(), format!("{name}:={value}")]);
+        }
+        arguments
+    }
+}
+
+/// The running nodes.
+pub enum Graph {
+    Composed(Vec<(&'static str, JoinHandle<Result<()>>)>),
+    Processes { children: Vec<(&'static str, Child)>, logs: PathBuf },
+}
+
+impl Graph {
+    /// All nodes in this process, on one participant.
+    pub fn compose(root: &Root, settings: &Settings, context: &Context) -> Result<Self> {
+        let mut tasks = Vec::new();
+        for node in NODES {
+            let (arguments, _) = RosArguments::parse(settings.arguments(root, node))?;
+            let task = match node {
+                "sim_workcell" => context.start(node, &arguments, sim_workcell::run),
+                "camera_fusion" => context.start(node, &arguments, camera_fusion::run),
+                "goal_oracle" => context.start(node, &arguments, goal_oracle::run),
+                "gctn_policy" => context.start(node, &arguments, gctn_policy::run),
+                _ => context.start(node, &arguments, suction_executor::run),
+            };
+            tasks.push((node, task?));
+        }
+        Ok(Self::Composed(tasks))
+    }
+
+    /// Each node a process; their output goes to files.
+    pub fn spawn(root: &Root, settings: &Settings, logs: &Path) -> Result<Self> {
+        let program = std::env::current_exe().context("path of the program")?;
+        let folder = program.parent().context("folder of the program")?;
+        std::fs::create_dir_all(logs).with_context(|| logs.display().to_string())?;
+        let mut children = Vec::new();
+        for node in NODES {
+            let executable = folder.join(node);
+            if !executable.is_file() {
+                bail!("{}: no such executable; build the workspace first", executable.display());
+            }
+            let log = logs.join(format!("{node}.log"));
+            let file = std::fs::File::create(&log).with_context(|| log.display().to_string())?;
+            let child = Command::new(&executable)
+                .args(settings.arguments(root, node))
+                .env("NODE_KIT_EXIT_WITH_PARENT", "1")
+                .stdin(Stdio::null())
+                .stdout(file.try_clone()?)
+                .stderr(file)
+                .kill_on_drop(true)
+                .spawn()
+                .with_context(|| executable.display().to_string())?;
+            children.push((node, child));
+        }
+        Ok(Self::Processes { children, logs: logs.to_owned() })
+    }
+
+    /// Waits until a node ends, which none should while a run lasts; says which and why.
+    pub async fn failure(&mut self) -> anyhow::Error {
+        match self {
+            Self::Composed(tasks) => {
+                let ends = tasks.iter_mut().map(|(node, task)| Box::pin(async move { (*node, task.await) }));
+                let ((node, end), _, _) = futures::future::select_all(ends).await;
+                match end {
+                    Ok(Ok(())) => anyhow::anyhow!("{node} ended"),
+                    Ok(Err(error)) => error.context(format!("{node} failed")),
+                    Err(error) => anyhow::anyhow!("{node} failed: {error}"),
+                }
+            }
+            Self::Processes { children, logs } => {
+                let ends = children.iter_mut().map(|(node, child)| Box::pin(async move { (*node, child.wait().await) }));
+                let ((node, status), _, _) = futures::future::select_all(ends).await;
+                let log = logs.join(format!("{node}.log"));
+                let text = std::fs::read_to_string(&log).unwrap_or_default();
+                let mut last: Vec<_> = text.lines().rev().take(5).collect();
+                last.reverse();
+                let status = status.map_or_else(|error| error.to_string(), |status: ExitStatus| status.to_string());
+                anyhow::anyhow!("{node} ended ({status}), see {}:\n{}", log.display(), last.join("\n"))
+            }
+        }
+    }
+
+    /// Ends all nodes: SIGTERM, two seconds' grace, then SIGKILL.
+    pub async fn stop(self, context: &Context) {
+        context.shutdown();
+        match self {
+            Self::Composed(tasks) => {
+                for (node, task) in tasks {
+                    if let Ok(Err(error)) = task.await {
+                        tracing::warn!("{node}: {error:#}");
+                    }
+                }
+            }
+            Self::Processes { mut children, .. } => {
+                for (_, child) in &children {
+                    let pid = child.id().and_then(|id| rustix::process::Pid::from_raw(id as i32));
+                    // A child that has ended has no id: nothing to signal.
+                    if let Some(pid) = pid {
+                        let _ = rustix::process::kill_process(pid, rustix::process::Signal::TERM);
+                    }
+                }
+                for (node, child) in &mut children {
+                    let grace = std::time::Duration::from_secs(4);
+                    if tokio::time::timeout(grace, child.wait()).await.is_err() {
+                        tracing::warn!("{node} did not end on SIGTERM: killed");
+                        let _ = child.kill().await;
+                    }
+                }
+            }
+        }
+    }
+}

@@ -1,0 +1,326 @@
+//! `sctn launch`: the whole graph on a problem's seed, under an operator, recorded.
+
+mod graph;
+mod operator;
+mod recorder;
+
+use crate::demos::demonstration;
+use crate::root::Root;
+use anyhow::{Context as _, Result, bail};
+use clap::Args;
+use graph::{Graph, Settings};
+use heightmap::Heightmap;
+use msgs::sctn_msgs::{Goal, PickPlace, Reward, StepConfirmation, StepResult};
+use multiravens::Environment;
+use node_kit::{Context, Network, Node, Parameters, Qos, RosArguments, wait_for_end};
+use operator::{Operator, OperatorKind, Question, automatic, outcome_name};
+use recorder::Recorder;
+use serde::{Deserialize, Serialize};
+use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
+
+/// With nothing heard for so long, something is broken. Wall time: it decides no outcome, only when to give up.
+const PATIENCE: Duration = Duration::from_secs(60);
+/// Refusals of an approval in a row after which the operator gives up.
+const MAX_REFUSALS: u32 = 5;
+
+/// Arguments of `sctn launch`.
+#[derive(Args)]
+pub struct Launch {
+    /// Problem to solve
+    #[arg(long)]
+    problem: String,
+    /// Seed of the episode (test: from 10,000 up)
+    #[arg(long)]
+    seed: u64,
+    /// Who approves proposals and confirms steps
+    #[arg(long, value_enum, default_value = "auto")]
+    operator: OperatorKind,
+    /// Checkpoint of the policy [default: the shipped one]
+    #[arg(long)]
+    checkpoint: Option<PathBuf>,
+    /// Folder for the bag, the demonstration, logs and a picture of the last heightmap
+    #[arg(long)]
+    record: Option<PathBuf>,
+    /// Record also what the cameras send
+    #[arg(long, requires = "record")]
+    record_images: bool,
+    /// Run each node as a process of its own
+    #[arg(long)]
+    processes: bool,
+    /// Print a JSON object last
+    #[arg(long)]
+    json: bool,
+}
+
+/// The node of this command has no parameters of its own.
+#[derive(Default, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+struct NoParameters {}
+
+impl Parameters for NoParameters {}
+
+/// How a run ended.
+#[derive(Debug, Serialize)]
+struct Report {
+    problem: String,
+    seed: u64,
+    completed: bool,
+    reward: f64,
+    steps: usize,
+    bag: Option<PathBuf>,
+}
+
+impl Launch {
+    pub fn run(self, root: &Root) -> Result<()> {
+        let problem = root.problem(&self.problem)?;
+        let work_cell = root.work_cell()?;
+        let max_steps = {
+            let mut environment = Environment::new(&problem, &work_cell);
+            environment.reset(self.seed)?;
+            environment.max_steps()
+        };
+        let temporary = tempfile::tempdir().context("folder for the demonstration")?;
+        let folder = self.record.clone().unwrap_or_else(|| temporary.path().to_owned());
+        let bag = folder.join("run");
+        if bag.exists() {
+            bail!("{}: already holds a run; name another folder", folder.display());
+        }
+        std::fs::create_dir_all(&folder).with_context(|| folder.display().to_string())?;
+        println!("demonstrating {} with seed {}", self.problem, self.seed);
+        let shown = folder.join("demonstration");
+        if !shown.exists() {
+            demonstration(&problem, &work_cell, self.seed)?.write(&shown)?;
+        }
+        let settings = Settings {
+            problem: self.problem.clone(),
+            seed: self.seed,
+            demonstration: std::path::absolute(shown)?,
+            checkpoint: self.checkpoint.clone().unwrap_or_else(|| root.shipped_checkpoint()),
+        };
+        gctn::set_threads(1);
+        let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build().context("tokio runtime")?;
+        let report = runtime.block_on(self.session(root, &settings, &folder, max_steps));
+        runtime.shutdown_timeout(Duration::from_millis(500));
+        let report = report?;
+        println!(
+            "{} after {} steps, reward {:.3}",
+            if report.completed { "completed" } else { "not completed" },
+            report.steps,
+            report.reward
+        );
+        if self.record.is_some() {
+            println!("bag: {}", bag.display());
+            println!("last heightmap: {}", folder.join("heightmap.png").display());
+        }
+        if self.json {
+            println!("{}", serde_json::to_string(&report)?);
+        }
+        if !report.completed {
+            bail!("{} with seed {} was not completed", self.problem, self.seed);
+        }
+        Ok(())
+    }
+
+    async fn session(&self, root: &Root, settings: &Settings, folder: &Path, max_steps: usize) -> Result<Report> {
+        let context = Context::new(Network::from_environment()?)?;
+        let (node, _) = context.node::<NoParameters>("sctn_launch", &RosArguments::default())?;
+        // Subscriptions stand before the nodes start: nothing of the run is missed.
+        let recorder = self.record.as_ref().map(|_| Recorder::start(&node, &folder.join("run"), self.record_images)).transpose()?;
+        let mut desk = Desk::new(&node)?;
+        let mut graph = if self.processes {
+            Graph::spawn(root, settings, &folder.join("logs"))?
+        } else {
+            Graph::compose(root, settings, &context)?
+        };
+        let ended = tokio::select! {
+            ended = desk.work(self.operator, max_steps) => ended,
+            error = graph.failure() => Err(error),
+            result = wait_for_end() => result.and(Err(anyhow::anyhow!("stopped by a signal"))),
+        };
+        graph.stop(&context).await;
+        let bag = match recorder {
+            Some(recorder) => Some(recorder.finish().await?),
+            None => None,
+        };
+        if let Some(heightmap) = desk.last_heightmap()? && self.record.is_some() {
+            heightmap::picture::write_heightmap(&folder.join("heightmap.png"), &heightmap, None)?;
+        }
+        ended?;
+        let Desk { steps, total_reward, complete, .. } = desk;
+        Ok(Report { problem: self.problem.clone(), seed: self.seed, completed: complete, reward: total_reward, steps, bag })
+    }
+}
+
+/// The operator's desk: what arrives, what is decided, how far the run is.
+struct Desk {
+    node: Node,
+    proposals: node_kit::Subscription<PickPlace>,
+    results: node_kit::Subscription<StepResult>,
+    rewards: node_kit::Subscription<Reward>,
+    goals: node_kit::Subscription<Goal>,
+    heightmaps: node_kit::Subscription<msgs::sctn_msgs::Heightmap>,
+    confirmations: node_kit::Publisher<StepConfirmation>,
+    operator: Operator,
+    step_count: u32,
+    step_started: Instant,
+    refusals: u32,
+    steps: usize,
+    total_reward: f64,
+    complete: bool,
+    last_heightmap: Option<msgs::sctn_msgs::Heightmap>,
+}
+
+impl Desk {
+    fn new(node: &Node) -> Result<Self> {
+        Ok(Self {
+            node: node.clone(),
+            proposals: node.subscription("pick_place", Qos::Event)?,
+            results: node.subscription("step_result", Qos::Event)?,
+            rewards: node.subscription("reward", Qos::Event)?,
+            goals: node.subscription("goal", Qos::Latched)?,
+            heightmaps: node.subscription("heightmap", Qos::Latched)?,
+            confirmations: node.publisher("step_confirmation", Qos::Event)?,
+            operator: Operator::default(),
+            step_count: 0,
+            step_started: Instant::now(),
+            refusals: 0,
+            steps: 0,
+            total_reward: 0.0,
+            complete: false,
+            last_heightmap: None,
+        })
+    }
+
+    fn last_heightmap(&self) -> Result<Option<Heightmap>> {
+        self.last_heightmap.as_ref().map(Heightmap::try_from).transpose().context("topic heightmap")
+    }
+
+    /// Until the run is over: the goal is complete, or the steps are used up.
+    async fn work(&mut self, kind: OperatorKind, max_steps: usize) -> Result<()> {
+        while !self.complete && (self.steps < max_steps || kind != OperatorKind::Auto) {
+            let question = tokio::select! {
+                proposal = self.proposals.recv() => self.operator.proposal(proposal),
+                result = self.results.recv() => self.result(result)?,
+                reward = self.rewards.recv() => {
+                    self.total_reward = reward.total;
+                    self.complete = reward.complete;
+                    self.operator.reward(reward)
+                }
+                goal = self.goals.recv() => {
+                    self.step_count = goal.step_count;
+                    None
+                }
+                heightmap = self.heightmaps.recv() => {
+                    self.last_heightmap = Some(heightmap);
+                    None
+                }
+                () = tokio::time::sleep(PATIENCE), if kind == OperatorKind::Auto => {
+                    bail!("nothing heard for {} s; no node said why: see the logs", PATIENCE.as_secs());
+                }
+            };
+            if let Some(question) = question {
+                self.answer(kind, question).await?;
+            }
+        }
+        self.wait_for_last_heightmap().await;
+        Ok(())
+    }
+
+    fn result(&mut self, result: StepResult) -> Result<Option<Question>> {
+        if result.outcome == StepResult::FAULT {
+            bail!("the robot failed: {}", result.reason);
+        }
+        if result.outcome == StepResult::REFUSED {
+            tracing::warn!("proposal {} refused: {}", result.proposal_id, result.reason);
+            self.refusals += 1;
+            if self.refusals >= MAX_REFUSALS {
+                bail!("{MAX_REFUSALS} refusals in a row, the last one: {}", result.reason);
+            }
+        }
+        Ok(self.operator.result(result))
+    }
+
+    async fn answer(&mut self, kind: OperatorKind, question: Question) -> Result<()> {
+        let proposal_id = match &question {
+            Question::Approve(proposal) => {
+                self.step_started = Instant::now();
+                self.describe(proposal);
+                proposal.id
+            }
+            Question::Confirm(result, reward) => {
+                self.steps += 1;
+                self.refusals = 0;
+                println!(
+                    "    {}, delta reward {:+.3}, reward {:.3}, {:.1} s",
+                    outcome_name(result.outcome),
+                    reward.delta,
+                    reward.total,
+                    self.step_started.elapsed().as_secs_f64()
+                );
+                result.proposal_id
+            }
+        };
+        let decision = match kind {
+            OperatorKind::None => return Ok(()),
+            OperatorKind::Auto => automatic(&question),
+            OperatorKind::Terminal => {
+                let ask = question.clone();
+                self.node.spawn_blocking(move || terminal(&ask)).await??
+            }
+        };
+        let mut confirmation = StepConfirmation { proposal_id, decision, operator_name: "sctn launch".into(), ..Default::default() };
+        confirmation.header.stamp = self.node.now();
+        self.confirmations.publish(confirmation);
+        Ok(())
+    }
+
+    fn describe(&self, proposal: &PickPlace) {
+        let PickPlace { step, attempt, pick, place, .. } = proposal;
+        println!(
+            "step {step}/{} attempt {attempt}: {} pick ({:.3}, {:.3}) place ({:.3}, {:.3}, {:.0} deg), scores {:.2} {:.2}",
+            self.step_count,
+            proposal.module,
+            pick.x,
+            pick.y,
+            place.x,
+            place.y,
+            place.theta.to_degrees(),
+            proposal.pick_score,
+            proposal.place_score
+        );
+    }
+
+    /// The reward of the last step comes before its heightmap.
+    async fn wait_for_last_heightmap(&mut self) {
+        if let Ok(heightmap) = tokio::time::timeout(Duration::from_secs(2), self.heightmaps.recv()).await {
+            self.last_heightmap = Some(heightmap);
+        }
+    }
+}
+
+/// Asks the person at the terminal.
+fn terminal(question: &Question) -> Result<u8> {
+    use std::io::Write;
+    let (text, answers): (&str, &[(&str, u8)]) = match question {
+        Question::Approve(_) => (
+            "carry it out? [y]es, [n]o, [s]top",
+            &[("y", StepConfirmation::APPROVE), ("n", StepConfirmation::REJECT), ("s", StepConfirmation::STOP)],
+        ),
+        Question::Confirm(..) => (
+            "did the step succeed? [y]es, [n]o: try again, [s]top",
+            &[("y", StepConfirmation::ADVANCE), ("n", StepConfirmation::RETRY), ("s", StepConfirmation::STOP)],
+        ),
+    };
+    loop {
+        print!("    {text}: ");
+        std::io::stdout().flush()?;
+        let mut line = String::new();
+        if std::io::stdin().read_line(&mut line)? == 0 {
+            bail!("the terminal was closed: nobody is left to decide");
+        }
+        if let Some((_, decision)) = answers.iter().find(|(key, _)| *key == line.trim().to_lowercase()) {
+            return Ok(*decision);
+        }
+    }
+}

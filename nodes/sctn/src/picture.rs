@@ -1,0 +1,89 @@
+//! `sctn picture`: what the cameras, the fusion, the demonstrator and the policy make of a problem.
+
+use crate::demos::demonstration;
+use crate::root::Root;
+use anyhow::{Context, Result};
+use clap::Args;
+use gctn::Policy;
+use heightmap::picture;
+use multiravens::Environment;
+use std::path::PathBuf;
+
+/// Arguments of `sctn picture`.
+#[derive(Args)]
+pub struct Picture {
+    /// Problem to draw
+    #[arg(long)]
+    problem: String,
+    /// Seed of the episode
+    #[arg(long)]
+    seed: u64,
+    /// Step of the demonstration to draw, from 1
+    #[arg(long, default_value_t = 1)]
+    step: usize,
+    /// Checkpoint of the policy [default: the shipped one]
+    #[arg(long)]
+    checkpoint: Option<PathBuf>,
+    /// Folder for the pictures
+    #[arg(long)]
+    out: PathBuf,
+}
+
+impl Picture {
+    pub fn run(self, root: &Root) -> Result<()> {
+        let (problem, work_cell) = (root.problem(&self.problem)?, root.work_cell()?);
+        std::fs::create_dir_all(&self.out).with_context(|| self.out.display().to_string())?;
+        let write = |name: &str, image| -> Result<()> {
+            let path = self.out.join(name);
+            picture::write(&path, image)?;
+            println!("{}", path.display());
+            Ok(())
+        };
+        let mut environment = Environment::new(&problem, &work_cell);
+        environment.reset(self.seed)?;
+        environment.observe()?;
+        for view in environment.cell().views() {
+            let intrinsics = &view.camera.intrinsics;
+            let image = picture::camera(intrinsics.width, intrinsics.height, view.rgb);
+            write(&format!("camera_{}.png", view.camera.name), &image)?;
+        }
+        let shown = demonstration(&problem, &work_cell, self.seed)?;
+        let count = shown.steps.len();
+        let step = self
+            .step
+            .checked_sub(1)
+            .and_then(|index| shown.steps.get(index));
+        let step = step.with_context(|| format!("--step {}: expected 1 to {count}", self.step))?;
+        let earned = shown.steps[..self.step - 1]
+            .iter()
+            .filter(|step| step.delta_reward > 0.0)
+            .count();
+        let goal = shown
+            .goals()
+            .get(earned)
+            .copied()
+            .context("no reward follows this step: there is no goal")?;
+        let both = |heightmap| {
+            picture::side_by_side(&[picture::colors(heightmap), picture::heights(heightmap)])
+        };
+        write("heightmap.png", &both(&step.observation))?;
+        write("goal.png", &both(goal))?;
+        let checkpoint = self.checkpoint.unwrap_or_else(|| root.shipped_checkpoint());
+        gctn::set_threads(1);
+        let decision = Policy::load(&checkpoint)?.decide(&step.observation, goal, &[])?;
+        let scores = |map: &gctn::ScoreMap| {
+            let mut image = picture::scores(&step.observation, map.rows, map.cols, &map.scores);
+            picture::mark(
+                &mut image,
+                &step.observation.workspace,
+                &decision.pick,
+                &decision.place,
+            );
+            image
+        };
+        write(
+            "scores.png",
+            &picture::side_by_side(&[scores(&decision.pick_map), scores(&decision.place_map)]),
+        )
+    }
+}

@@ -1,0 +1,187 @@
+//! `sctn train`.
+
+use crate::evaluate::summary;
+use crate::progress;
+use crate::root::Root;
+use anyhow::{Context, Result};
+use clap::Args;
+use gctn::{ModelCard, Policy};
+use sctn::{DataSet, Recipe, Training, evaluate};
+use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
+use std::io::Write;
+use std::path::{Path, PathBuf};
+use std::sync::Mutex;
+
+/// Arguments of `sctn train`.
+#[derive(Args)]
+pub struct Train {
+    /// Recipe
+    #[arg(long)]
+    recipe: PathBuf,
+    /// Folder that `sctn demos` wrote
+    #[arg(long)]
+    demos: PathBuf,
+    /// Folder for state, snapshots and the policy
+    #[arg(long)]
+    out: PathBuf,
+    /// Go on with the training in that folder
+    #[arg(long)]
+    resume: bool,
+    /// Print a JSON object last
+    #[arg(long)]
+    json: bool,
+}
+
+/// One snapshot and how it did on validation episodes.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+struct Snapshot {
+    step: u64,
+    checkpoint: PathBuf,
+    /// Mean losses since the snapshot before.
+    pick_loss: f64,
+    place_loss: f64,
+    /// Completion rate of each problem on validation episodes.
+    completion: BTreeMap<String, f64>,
+    /// Mean reward of each problem.
+    reward: BTreeMap<String, f64>,
+}
+
+impl Snapshot {
+    /// Better on validation first, then later.
+    fn rank(&self) -> (f64, f64, u64) {
+        let mean = |values: &BTreeMap<String, f64>| {
+            values.values().sum::<f64>() / values.len().max(1) as f64
+        };
+        (mean(&self.completion), mean(&self.reward), self.step)
+    }
+}
+
+impl Train {
+    pub fn run(self, root: &Root) -> Result<()> {
+        let recipe = Recipe::load(&self.recipe)?;
+        let mut data = DataSet::default();
+        for problem in &recipe.problems {
+            data.load(&self.demos, problem, recipe.demonstrations)?;
+        }
+        tracing::info!("{} demonstrations, {} steps", data.len(), data.step_count());
+        gctn::set_threads(recipe.training.threads);
+        let mut training = Training::open(recipe, data, &self.out, self.resume)?;
+        let log = self.out.join("snapshots.jsonl");
+        let mut snapshots = read_log(&log, training.step())?;
+        let bar = progress::bar(training.recipe().training.steps, "steps");
+        bar.set_position(training.step());
+        let (mut pick, mut place, mut count) = (0.0, 0.0, 0u32);
+        while !training.is_done() {
+            let losses = training.advance()?;
+            pick += losses.pick;
+            place += losses.place;
+            count += 1;
+            bar.inc(1);
+            bar.set_message(format!(
+                "pick loss {:.3}, place loss {:.3}",
+                pick / f64::from(count),
+                place / f64::from(count)
+            ));
+            if training.is_snapshot_due() {
+                let checkpoint = training.save_snapshot(&self.card(&training))?;
+                let mut snapshot = Snapshot {
+                    step: training.step(),
+                    checkpoint,
+                    pick_loss: pick / f64::from(count),
+                    place_loss: place / f64::from(count),
+                    completion: BTreeMap::new(),
+                    reward: BTreeMap::new(),
+                };
+                (pick, place, count) = (0.0, 0.0, 0);
+                bar.suspend(|| validate(root, training.recipe(), &mut snapshot))?;
+                append(&log, &snapshot)?;
+                snapshots.push(snapshot);
+            }
+        }
+        bar.finish_and_clear();
+        let best = snapshots.iter().max_by(|a, b| {
+            a.rank()
+                .partial_cmp(&b.rank())
+                .unwrap_or(std::cmp::Ordering::Equal)
+        });
+        let best = best.context("no snapshot was taken")?;
+        let policy = self.out.join("policy.safetensors");
+        std::fs::copy(&best.checkpoint, &policy).with_context(|| policy.display().to_string())?;
+        if self.json {
+            println!(
+                "{}",
+                serde_json::json!({ "policy": policy, "best": best, "snapshots": snapshots })
+            );
+        } else {
+            println!("{}: the snapshot of step {}", policy.display(), best.step);
+        }
+        Ok(())
+    }
+
+    /// Says how the checkpoint was made.
+    fn card(&self, training: &Training) -> ModelCard {
+        let recipe = training.recipe();
+        ModelCard::from([
+            (
+                "recipe".into(),
+                serde_json::to_string(recipe).unwrap_or_default(),
+            ),
+            ("step".into(), training.step().to_string()),
+            (
+                "trained with".into(),
+                format!("sctn {}", env!("CARGO_PKG_VERSION")),
+            ),
+        ])
+    }
+}
+
+/// Lets a snapshot act on the validation episodes of every problem.
+fn validate(root: &Root, recipe: &Recipe, snapshot: &mut Snapshot) -> Result<()> {
+    if recipe.validation.episodes == 0 {
+        return Ok(());
+    }
+    let work_cell = root.work_cell()?;
+    let policies: Vec<_> = (0..recipe.training.threads.max(1))
+        .map(|_| Ok(Mutex::new(Policy::load(&snapshot.checkpoint)?)))
+        .collect::<Result<_>>()?;
+    for name in &recipe.problems {
+        let problem = root.problem(name)?;
+        let report = evaluate(
+            &problem,
+            &work_cell,
+            &policies,
+            recipe.validation.seed,
+            recipe.validation.episodes,
+            |_| (),
+        )?;
+        tracing::info!("step {}: {}", snapshot.step, summary(&report));
+        snapshot.completion.insert(name.clone(), report.completion);
+        snapshot.reward.insert(name.clone(), report.reward);
+    }
+    Ok(())
+}
+
+/// Snapshots of an earlier run, up to the step that it stopped at.
+fn read_log(path: &Path, step: u64) -> Result<Vec<Snapshot>> {
+    if step == 0 || !path.exists() {
+        return Ok(Vec::new());
+    }
+    let text = std::fs::read_to_string(path).with_context(|| path.display().to_string())?;
+    let snapshots = text.lines().map(|line| {
+        serde_json::from_str::<Snapshot>(line).with_context(|| path.display().to_string())
+    });
+    let mut snapshots = snapshots.collect::<Result<Vec<_>>>()?;
+    snapshots.retain(|snapshot| snapshot.step <= step);
+    Ok(snapshots)
+}
+
+fn append(path: &Path, snapshot: &Snapshot) -> Result<()> {
+    let open = std::fs::OpenOptions::new()
+        .create(true)
+        .append(true)
+        .open(path);
+    let mut file = open.with_context(|| path.display().to_string())?;
+    writeln!(file, "{}", serde_json::to_string(snapshot)?)
+        .with_context(|| path.display().to_string())
+}

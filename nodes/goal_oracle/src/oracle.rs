@@ -1,0 +1,643 @@
+//! Which goal is next: proposals, results and confirmations in, goals out, no ROS around it.
+
+use std::collections::BTreeSet;
+
+use bags::Demonstration;
+use msgs::{
+    builtin_interfaces::Time,
+    convert::{self, ConvertError},
+    sctn_msgs::{Goal, PickPlace, StepConfirmation, StepResult},
+    std_msgs::Header,
+};
+
+/// Proposal ids that are remembered as seen.
+const MAX_SEEN: usize = 100_000;
+
+/// A demonstration without a goal.
+#[derive(Debug, thiserror::Error)]
+pub enum SequenceError {
+    /// Nothing in it earned a reward.
+    #[error("the demonstration of {problem} has no step with a reward, expected at least one")]
+    NoGoals {
+        /// The problem.
+        problem: String,
+    },
+    /// A goal cannot be written as a message.
+    #[error("goal of step {step}: {source}")]
+    Convert {
+        /// From 1.
+        step: usize,
+        /// Why.
+        source: ConvertError,
+    },
+}
+
+/// Why a confirmation changes nothing.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+pub enum Refusal {
+    /// No such proposal for the present goal.
+    #[error("proposal {id} is unknown for step {step}, attempt {attempt}")]
+    Unknown {
+        /// The proposal named.
+        id: u64,
+        /// Of the present goal.
+        step: u32,
+        /// Of the present goal.
+        attempt: u32,
+    },
+    /// It belongs to a goal that is past: stale or twice.
+    #[error(
+        "proposal {id} is of an earlier goal; the present one is step {step}, attempt {attempt}"
+    )]
+    Stale {
+        /// The proposal named.
+        id: u64,
+        /// Of the present goal.
+        step: u32,
+        /// Of the present goal.
+        attempt: u32,
+    },
+    /// Another decision on this proposal waits for the motion's end.
+    #[error("proposal {id}: a decision waits for its result already")]
+    Twice {
+        /// The proposal named.
+        id: u64,
+    },
+    /// The run is over.
+    #[error("the run was stopped")]
+    Stopped,
+    /// The run is over.
+    #[error("all steps are done")]
+    Complete,
+    /// A number that is no decision.
+    #[error("decision is {0}, expected APPROVE=1, REJECT=2, ADVANCE=3, RETRY=4 or STOP=5")]
+    NoDecision(u8),
+    /// The parameter `require_confirmation` is false.
+    #[error("this oracle decides by itself (require_confirmation is false)")]
+    NotAsked,
+}
+
+/// What an input leads to.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Change {
+    /// Nothing to do.
+    None,
+    /// A new goal is to be latched.
+    Goal(Box<Goal>),
+    /// The operator ended the run.
+    Stopped,
+}
+
+/// The proposal that was made for the present goal.
+#[derive(Clone, Copy, Debug, PartialEq)]
+struct Current {
+    id: u64,
+    /// Stamp of its result, once the arm has moved for it.
+    moved: Option<Time>,
+    /// What the operator said before the result arrived here: the two come by different topics.
+    waiting: Option<Verdict>,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Verdict {
+    Advance,
+    Retry,
+}
+
+/// Walks through the goals of a demonstration.
+///
+/// ADVANCE and RETRY count for the newest proposal of the present goal once the arm has moved for it,
+/// whatever the motion's outcome: the operator has the last word. A STOP always counts.
+#[derive(Debug)]
+pub struct Oracle {
+    goals: Vec<Goal>,
+    /// Index of the present goal; the number of goals when complete.
+    index: usize,
+    attempt: u32,
+    /// Heightmaps must not be older.
+    stamp: Time,
+    stopped: bool,
+    current: Option<Current>,
+    /// Proposals of earlier goals, and superseded ones of this.
+    seen: BTreeSet<u64>,
+    require_confirmation: bool,
+}
+
+/// The goals of a demonstration: what was seen after each step with a reward.
+pub fn sequence(
+    demonstration: &Demonstration,
+    world_frame: &str,
+) -> Result<Vec<Goal>, SequenceError> {
+    let rewarded: Vec<_> = demonstration
+        .steps
+        .iter()
+        .filter(|step| step.delta_reward > 0.0)
+        .zip(demonstration.goals())
+        .collect();
+    if rewarded.is_empty() {
+        return Err(SequenceError::NoGoals {
+            problem: demonstration.problem.clone(),
+        });
+    }
+    let step_count = rewarded.len() as u32;
+    let goal = |(index, (step, heightmap)): (usize, (&bags::DemonstrationStep, _))| {
+        let header = Header {
+            frame_id: world_frame.to_owned(),
+            ..Header::default()
+        };
+        // How many views a demonstration was fused from is not known.
+        let heightmap =
+            convert::heightmap_to_msg(heightmap, header.clone(), 0, 0.0).map_err(|source| {
+                SequenceError::Convert {
+                    step: index + 1,
+                    source,
+                }
+            })?;
+        Ok(Goal {
+            header,
+            problem: demonstration.problem.clone(),
+            demonstration: format!("{}/{}", demonstration.problem, demonstration.seed),
+            step: index as u32 + 1,
+            step_count,
+            attempt: 0,
+            complete: false,
+            module: step.module.clone(),
+            settings: convert::settings_to_msg(&step.settings),
+            heightmap,
+        })
+    };
+    let owned = rewarded
+        .into_iter()
+        .map(|(step, heightmap): (_, &heightmap::Heightmap)| (step, heightmap.clone()));
+    owned.enumerate().map(goal).collect()
+}
+
+impl Oracle {
+    /// Starts at the first of `goals`, of which there is at least one.
+    pub fn new(goals: Vec<Goal>, require_confirmation: bool) -> Self {
+        Self {
+            goals,
+            index: 0,
+            attempt: 0,
+            stamp: Time::default(),
+            stopped: false,
+            current: None,
+            seen: BTreeSet::new(),
+            require_confirmation,
+        }
+    }
+
+    /// The present goal; after the last step the last one, marked as complete.
+    pub fn goal(&self) -> Goal {
+        let complete = self.is_complete();
+        let mut goal = self.goals[self.index.min(self.goals.len() - 1)].clone();
+        goal.header.stamp = self.stamp;
+        goal.attempt = self.attempt;
+        goal.complete = complete;
+        goal
+    }
+
+    /// Whether all steps are done.
+    pub fn is_complete(&self) -> bool {
+        self.index == self.goals.len()
+    }
+
+    /// Whether the operator ended the run.
+    pub fn is_stopped(&self) -> bool {
+        self.stopped
+    }
+
+    /// Step (from 1), number of steps, attempt.
+    pub fn progress(&self) -> (u32, u32, u32) {
+        let count = self.goals.len() as u32;
+        ((self.index as u32 + 1).min(count), count, self.attempt)
+    }
+
+    /// A proposal was published. The newest for the present goal is current, until the arm moves.
+    pub fn proposed(&mut self, proposal: &PickPlace) {
+        let goal = &self.goals[self.index.min(self.goals.len() - 1)];
+        let of_this_goal = (proposal.step, proposal.attempt) == (goal.step, self.attempt)
+            && proposal.problem == goal.problem
+            && !self.is_complete()
+            && !self.stopped;
+        if !of_this_goal {
+            self.remember(proposal.id);
+            return;
+        }
+        let moved = self.current.is_some_and(|current| current.moved.is_some());
+        if moved || self.seen.contains(&proposal.id) {
+            return;
+        }
+        match &self.current {
+            Some(current) if current.id == proposal.id => {}
+            other => {
+                if let Some(superseded) = *other {
+                    self.remember(superseded.id);
+                }
+                self.current = Some(Current {
+                    id: proposal.id,
+                    moved: None,
+                    waiting: None,
+                });
+            }
+        }
+    }
+
+    /// The executor has reported.
+    pub fn result(&mut self, result: &StepResult) -> Change {
+        if self.stopped || self.is_complete() {
+            return Change::None;
+        }
+        match result.outcome {
+            StepResult::PLACED
+            | StepResult::NO_CONTACT
+            | StepResult::GRASP_FAILED
+            | StepResult::DROPPED
+            | StepResult::LAG_ABORTED
+            | StepResult::FAULT => self.moved(result),
+            // Nothing has moved, so what was seen before still holds: the stamp stays.
+            StepResult::REJECTED if self.is_current(result.proposal_id) => {
+                self.latch(self.index, self.attempt + 1, self.stamp)
+            }
+            _ => Change::None,
+        }
+    }
+
+    fn moved(&mut self, result: &StepResult) -> Change {
+        let id = result.proposal_id;
+        // The proposal itself may have been published before this node was discovered: the executor
+        // has seen it, and it is not one of an earlier goal.
+        if self.current.is_none() && !self.seen.contains(&id) {
+            self.current = Some(Current {
+                id,
+                moved: None,
+                waiting: None,
+            });
+        }
+        let Some(current) = &mut self.current else {
+            return Change::None;
+        };
+        if current.id != id || current.moved.is_some() {
+            return Change::None;
+        }
+        current.moved = Some(result.header.stamp);
+        let verdict = match (self.require_confirmation, result.outcome) {
+            (true, _) => current.waiting,
+            (false, StepResult::PLACED) => Some(Verdict::Advance),
+            (false, _) => Some(Verdict::Retry),
+        };
+        match verdict {
+            Some(verdict) => self.decide(verdict, result.header.stamp),
+            None => Change::None,
+        }
+    }
+
+    /// The operator has spoken. Approvals and rejections are the executor's business.
+    pub fn confirmed(&mut self, confirmation: &StepConfirmation) -> Result<Change, Refusal> {
+        let verdict = match confirmation.decision {
+            StepConfirmation::APPROVE | StepConfirmation::REJECT => return Ok(Change::None),
+            StepConfirmation::STOP => {
+                let first = !self.stopped;
+                self.stopped = true;
+                return Ok(if first { Change::Stopped } else { Change::None });
+            }
+            StepConfirmation::ADVANCE => Verdict::Advance,
+            StepConfirmation::RETRY => Verdict::Retry,
+            other => return Err(Refusal::NoDecision(other)),
+        };
+        if self.stopped {
+            return Err(Refusal::Stopped);
+        }
+        if self.is_complete() {
+            return Err(Refusal::Complete);
+        }
+        if !self.require_confirmation {
+            return Err(Refusal::NotAsked);
+        }
+        let id = confirmation.proposal_id;
+        let (step, attempt) = (self.goals[self.index].step, self.attempt);
+        match &mut self.current {
+            Some(current) if current.id == id => match (current.moved, current.waiting) {
+                (Some(stamp), _) => Ok(self.decide(verdict, stamp)),
+                (None, None) => {
+                    current.waiting = Some(verdict);
+                    Ok(Change::None)
+                }
+                (None, Some(_)) => Err(Refusal::Twice { id }),
+            },
+            _ if self.seen.contains(&id) => Err(Refusal::Stale { id, step, attempt }),
+            _ => Err(Refusal::Unknown { id, step, attempt }),
+        }
+    }
+
+    fn is_current(&self, id: u64) -> bool {
+        self.current.is_some_and(|current| current.id == id)
+    }
+
+    fn decide(&mut self, verdict: Verdict, stamp: Time) -> Change {
+        match verdict {
+            Verdict::Advance => self.latch(self.index + 1, 0, stamp),
+            Verdict::Retry => self.latch(self.index, self.attempt + 1, stamp),
+        }
+    }
+
+    fn latch(&mut self, index: usize, attempt: u32, stamp: Time) -> Change {
+        if let Some(current) = self.current.take() {
+            self.remember(current.id);
+        }
+        self.index = index;
+        self.attempt = attempt;
+        self.stamp = stamp;
+        Change::Goal(Box::new(self.goal()))
+    }
+
+    fn remember(&mut self, id: u64) {
+        if self.seen.len() < MAX_SEEN {
+            self.seen.insert(id);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    fn oracle(count: u32) -> Oracle {
+        with_confirmation(count, true)
+    }
+
+    fn with_confirmation(count: u32, require_confirmation: bool) -> Oracle {
+        let goal = |step| Goal {
+            problem: "placing".into(),
+            step,
+            step_count: count,
+            ..Goal::default()
+        };
+        Oracle::new((1..=count).map(goal).collect(), require_confirmation)
+    }
+
+    fn proposal(id: u64, step: u32, attempt: u32) -> PickPlace {
+        PickPlace {
+            id,
+            problem: "placing".into(),
+            step,
+            attempt,
+            ..PickPlace::default()
+        }
+    }
+
+    fn result(id: u64, outcome: u8, sec: i32) -> StepResult {
+        let mut result = StepResult {
+            proposal_id: id,
+            outcome,
+            ..StepResult::default()
+        };
+        result.header.stamp.sec = sec;
+        result
+    }
+
+    fn says(decision: u8, proposal_id: u64) -> StepConfirmation {
+        StepConfirmation {
+            proposal_id,
+            decision,
+            ..StepConfirmation::default()
+        }
+    }
+
+    fn goal(change: Change) -> (u32, u32, i32, bool) {
+        match change {
+            Change::Goal(goal) => (
+                goal.step,
+                goal.attempt,
+                goal.header.stamp.sec,
+                goal.complete,
+            ),
+            other => panic!("expected a goal, got {other:?}"),
+        }
+    }
+
+    #[test]
+    fn an_advance_after_the_motion_latches_the_next_goal_with_the_results_stamp() {
+        let mut oracle = oracle(2);
+        oracle.proposed(&proposal(7, 1, 0));
+        assert_eq!(
+            oracle.result(&result(7, StepResult::PLACED, 5)),
+            Change::None
+        );
+        let change = oracle
+            .confirmed(&says(StepConfirmation::ADVANCE, 7))
+            .unwrap();
+        assert_eq!(goal(change), (2, 0, 5, false));
+        oracle.proposed(&proposal(8, 2, 0));
+        oracle.result(&result(8, StepResult::DROPPED, 9));
+        let change = oracle
+            .confirmed(&says(StepConfirmation::ADVANCE, 8))
+            .unwrap();
+        assert_eq!(goal(change), (2, 0, 9, true));
+        assert_eq!(
+            oracle.confirmed(&says(StepConfirmation::ADVANCE, 8)),
+            Err(Refusal::Complete)
+        );
+    }
+
+    #[test]
+    fn a_retry_keeps_the_step_and_counts_the_attempt() {
+        let mut oracle = oracle(2);
+        oracle.proposed(&proposal(7, 1, 0));
+        oracle.result(&result(7, StepResult::NO_CONTACT, 5));
+        let change = oracle.confirmed(&says(StepConfirmation::RETRY, 7)).unwrap();
+        assert_eq!(goal(change), (1, 1, 5, false));
+    }
+
+    #[test]
+    fn a_rejection_asks_for_another_proposal_from_the_same_observation() {
+        let mut oracle = oracle(2);
+        oracle.proposed(&proposal(7, 1, 0));
+        let change = oracle.result(&result(7, StepResult::REJECTED, 5));
+        assert_eq!(goal(change), (1, 1, 0, false));
+        assert_eq!(
+            oracle.result(&result(7, StepResult::REJECTED, 5)),
+            Change::None
+        );
+    }
+
+    #[test]
+    fn a_decision_that_overtakes_its_result_waits_for_it() {
+        let mut oracle = oracle(2);
+        oracle.proposed(&proposal(7, 1, 0));
+        let early = oracle.confirmed(&says(StepConfirmation::ADVANCE, 7));
+        assert_eq!(early, Ok(Change::None));
+        assert_eq!(
+            oracle.confirmed(&says(StepConfirmation::RETRY, 7)),
+            Err(Refusal::Twice { id: 7 })
+        );
+        let change = oracle.result(&result(7, StepResult::PLACED, 5));
+        assert_eq!(goal(change), (2, 0, 5, false));
+    }
+
+    #[test]
+    fn a_motion_for_a_proposal_that_was_not_heard_counts() {
+        let mut oracle = oracle(2);
+        assert_eq!(
+            oracle.result(&result(7, StepResult::PLACED, 5)),
+            Change::None
+        );
+        let change = oracle
+            .confirmed(&says(StepConfirmation::ADVANCE, 7))
+            .unwrap();
+        assert_eq!(goal(change), (2, 0, 5, false));
+    }
+
+    #[test]
+    fn stale_unknown_and_repeated_confirmations_change_nothing() {
+        let mut oracle = oracle(3);
+        oracle.proposed(&proposal(7, 1, 0));
+        oracle.result(&result(7, StepResult::PLACED, 5));
+        oracle
+            .confirmed(&says(StepConfirmation::ADVANCE, 7))
+            .unwrap();
+        let before = oracle.goal();
+        let (step, attempt) = (2, 0);
+        assert_eq!(
+            oracle.confirmed(&says(StepConfirmation::ADVANCE, 7)),
+            Err(Refusal::Stale {
+                id: 7,
+                step,
+                attempt
+            })
+        );
+        assert_eq!(
+            oracle.confirmed(&says(StepConfirmation::RETRY, 99)),
+            Err(Refusal::Unknown {
+                id: 99,
+                step,
+                attempt
+            })
+        );
+        assert_eq!(oracle.confirmed(&says(77, 7)), Err(Refusal::NoDecision(77)));
+        // The old result once more, and an old proposal once more.
+        assert_eq!(
+            oracle.result(&result(7, StepResult::PLACED, 5)),
+            Change::None
+        );
+        oracle.proposed(&proposal(7, 1, 0));
+        assert!(
+            oracle
+                .confirmed(&says(StepConfirmation::ADVANCE, 7))
+                .is_err()
+        );
+        assert_eq!(oracle.goal(), before);
+    }
+
+    #[test]
+    fn a_superseded_proposal_cannot_advance() {
+        let mut oracle = oracle(2);
+        oracle.proposed(&proposal(7, 1, 0));
+        oracle.proposed(&proposal(8, 1, 0));
+        assert_eq!(
+            oracle.result(&result(7, StepResult::PLACED, 5)),
+            Change::None
+        );
+        assert!(matches!(
+            oracle.confirmed(&says(StepConfirmation::ADVANCE, 7)),
+            Err(Refusal::Stale { id: 7, .. })
+        ));
+        oracle.result(&result(8, StepResult::PLACED, 6));
+        let change = oracle
+            .confirmed(&says(StepConfirmation::ADVANCE, 8))
+            .unwrap();
+        assert_eq!(goal(change), (2, 0, 6, false));
+    }
+
+    #[test]
+    fn proposals_for_another_problem_step_or_attempt_are_not_current() {
+        let mut oracle = oracle(2);
+        oracle.proposed(&proposal(7, 2, 0));
+        oracle.proposed(&proposal(8, 1, 1));
+        oracle.proposed(&PickPlace {
+            problem: "chaining".into(),
+            ..proposal(9, 1, 0)
+        });
+        for id in [7, 8, 9] {
+            oracle.result(&result(id, StepResult::PLACED, 5));
+            assert!(
+                oracle
+                    .confirmed(&says(StepConfirmation::ADVANCE, id))
+                    .is_err()
+            );
+        }
+        assert_eq!(oracle.progress(), (1, 2, 0));
+    }
+
+    #[test]
+    fn a_refused_approval_changes_nothing() {
+        let mut oracle = oracle(2);
+        oracle.proposed(&proposal(7, 1, 0));
+        assert_eq!(
+            oracle.result(&result(7, StepResult::REFUSED, 5)),
+            Change::None
+        );
+        assert_eq!(
+            oracle.confirmed(&says(StepConfirmation::APPROVE, 7)),
+            Ok(Change::None)
+        );
+        assert_eq!(oracle.progress(), (1, 2, 0));
+    }
+
+    #[test]
+    fn a_stop_ends_the_run_whatever_it_names() {
+        let mut oracle = oracle(2);
+        oracle.proposed(&proposal(7, 1, 0));
+        assert_eq!(
+            oracle.confirmed(&says(StepConfirmation::STOP, 1234)),
+            Ok(Change::Stopped)
+        );
+        oracle.result(&result(7, StepResult::PLACED, 5));
+        assert_eq!(
+            oracle.confirmed(&says(StepConfirmation::ADVANCE, 7)),
+            Err(Refusal::Stopped)
+        );
+        assert!(oracle.is_stopped() && !oracle.is_complete());
+    }
+
+    #[test]
+    fn without_required_confirmation_the_outcome_decides() {
+        let mut oracle = with_confirmation(2, false);
+        oracle.proposed(&proposal(7, 1, 0));
+        let change = oracle.result(&result(7, StepResult::GRASP_FAILED, 3));
+        assert_eq!(goal(change), (1, 1, 3, false));
+        oracle.proposed(&proposal(8, 1, 1));
+        let change = oracle.result(&result(8, StepResult::PLACED, 5));
+        assert_eq!(goal(change), (2, 0, 5, false));
+        assert_eq!(
+            oracle.confirmed(&says(StepConfirmation::ADVANCE, 8)),
+            Err(Refusal::NotAsked)
+        );
+    }
+
+    proptest! {
+        /// However confused the messages, a step is passed only by a motion and an ADVANCE for it.
+        #[test]
+        fn steps_never_outnumber_motions(
+            inputs in prop::collection::vec((0u8..3, 0u64..6, 0u8..12, 1u32..4, 0u32..3), 0..200)
+        ) {
+            let mut oracle = oracle(3);
+            let mut moved = BTreeSet::new();
+            for (kind, id, code, step, attempt) in inputs {
+                match kind {
+                    0 => oracle.proposed(&proposal(id, step, attempt)),
+                    1 => {
+                        if (1..=5).contains(&code) || code == StepResult::FAULT {
+                            moved.insert(id);
+                        }
+                        oracle.result(&result(id, code, 1));
+                    }
+                    _ => drop(oracle.confirmed(&says(code, id))),
+                }
+                let (step, _, _) = oracle.progress();
+                prop_assert!(step as usize <= moved.len() + 1);
+            }
+        }
+    }
+}

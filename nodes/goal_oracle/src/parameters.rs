@@ -1,0 +1,61 @@
+//! Parameters of the node.
+
+use std::path::{Path, PathBuf};
+
+use node_kit::{InvalidParameter, Parameters};
+use serde::{Deserialize, Serialize};
+
+/// Explained in config/goal_oracle.yaml.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+#[allow(missing_docs)]
+pub struct GoalOracleParameters {
+    pub demonstration: PathBuf,
+    pub require_confirmation: bool,
+    pub world_frame: String,
+}
+
+impl Default for GoalOracleParameters {
+    fn default() -> Self {
+        Self {
+            demonstration: PathBuf::new(),
+            require_confirmation: true,
+            world_frame: "world".into(),
+        }
+    }
+}
+
+impl GoalOracleParameters {
+    /// The demonstration's path; there is no default one.
+    pub(crate) fn demonstration(&self) -> Result<&Path, InvalidParameter> {
+        if self.demonstration == Path::new("") {
+            return Err(InvalidParameter::new(
+                "demonstration",
+                "expected the path of a demonstration bag, found nothing",
+            ));
+        }
+        Ok(&self.demonstration)
+    }
+}
+
+impl Parameters for GoalOracleParameters {
+    fn validate(&self) -> Result<(), InvalidParameter> {
+        if self.world_frame.is_empty() {
+            return Err(InvalidParameter::new("world_frame", "must not be empty"));
+        }
+        Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn the_configuration_file_holds_the_defaults() {
+        let text = include_str!("../../../config/goal_oracle.yaml");
+        let read: GoalOracleParameters =
+            node_kit::load_text("goal_oracle.yaml", text, "/cell/goal_oracle").unwrap();
+        assert_eq!(read, GoalOracleParameters::default());
+    }
+}

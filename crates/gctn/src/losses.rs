@@ -268,7 +268,7 @@ mod tests {
             );
 
             // The rotation loss looks at the same place the same way: a wrong label costs more.
-            let mut loss = |label: Label| {
+            let loss = |label: Label| {
                 let mut features = features(&sample);
                 features.scale = Tensor::from_slice(&[10f32]);
                 let mut rng = ChaCha8Rng::seed_from_u64(1);

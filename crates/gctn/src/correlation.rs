@@ -202,11 +202,9 @@ mod tests {
             let loss = (way(&key, &windows, &grid) * &weight).sum(None::<Kind>);
             Tensor::run_backward(&[loss], &[key, windows], false, false)
         });
-        for index in 0..2 {
-            let error = (&gradients[0][index] - &gradients[1][index])
-                .abs()
-                .max()
-                .double_value(&[]);
+        let [ours, theirs] = &gradients;
+        for (ours, theirs) in ours.iter().zip(theirs) {
+            let error = (ours - theirs).abs().max().double_value(&[]);
             assert!(error < 1e-10, "{error}");
         }
     }

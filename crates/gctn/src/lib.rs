@@ -26,8 +26,18 @@ pub use policy::{Decision, Policy, ScoreMap};
 pub use sample::Sample;
 pub use trainer::{Losses, Trainer};
 
-/// Sets how many threads libtorch computes with, in the whole process. Sums are split by thread: another
-/// number gives other last bits.
+use std::sync::atomic::{AtomicUsize, Ordering};
+
+static THREADS: AtomicUsize = AtomicUsize::new(1);
+
+/// Sets how many threads libtorch computes with, in the whole process; 1 unless said. Sums are split by
+/// thread: another number gives other last bits.
 pub fn set_threads(threads: usize) {
-    tch::set_num_threads(threads.clamp(1, 1024) as i32);
+    THREADS.store(threads.clamp(1, 1024), Ordering::Relaxed);
+    apply_threads();
+}
+
+/// Sets the threads for work that the calling thread starts: OpenMP keeps the number by thread.
+fn apply_threads() {
+    tch::set_num_threads(THREADS.load(Ordering::Relaxed) as i32);
 }

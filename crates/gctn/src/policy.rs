@@ -100,6 +100,7 @@ impl Policy {
         goal: &Heightmap,
         exclude: &[Isometry2<f64>],
     ) -> Result<Decision, Error> {
+        crate::apply_threads();
         let config = &self.model.config;
         check_heightmap(config, "observation", observation)?;
         check_heightmap(config, "goal", goal)?;
@@ -207,7 +208,7 @@ impl Policy {
             grid.coordinate_px(col as f64 + offset[0]),
             grid.coordinate_px(row as f64 + offset[1]),
         );
-        let score = |logit: f32| (f64::from(logit) - log_sum).exp();
+        let score = |logit: f32| (f64::from(logit) - log_sum).exp().min(1.0);
         let scores = map.iter().map(|logit| score(*logit) as f32).collect();
         Ok((place_px, rotation, score(logits[best]), self.map(scores)))
     }

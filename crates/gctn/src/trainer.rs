@@ -166,6 +166,7 @@ impl Trainer {
         rng: &mut ChaCha8Rng,
         augment: bool,
     ) -> Result<[Tensor; 2], Error> {
+        crate::apply_threads();
         let network = &self.model.config;
         let encoding = self.model.encoding();
         let cells = network.rows * network.cols;

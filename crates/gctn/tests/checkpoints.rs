@@ -61,6 +61,15 @@ fn a_checkpoint_decides_as_its_trainer() {
 }
 
 #[test]
+fn a_decision_is_the_same_on_another_thread() {
+    let policy = trainer().policy().unwrap();
+    let [observation, goal] = scene();
+    let here = policy.decide(&observation, &goal, &[]).unwrap();
+    let there = std::thread::spawn(move || policy.decide(&observation, &goal, &[]).unwrap());
+    assert_eq!(here, there.join().unwrap());
+}
+
+#[test]
 fn sixteen_bits_decide_nearly_the_same_from_half_the_bytes() {
     let (_full_folder, full) = saved(Storage::F32);
     let (_half_folder, half) = saved(Storage::F16);

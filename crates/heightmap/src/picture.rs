@@ -4,7 +4,8 @@
 //! left. Yaw turns clockwise on the picture. A cell is [`SCALE`] pixels wide.
 
 use crate::{Heightmap, Workspace};
-use image::{Rgb, RgbImage};
+use image::Rgb;
+pub use image::RgbImage;
 use nalgebra::{Isometry2, Point2, Vector2};
 use std::path::{Path, PathBuf};
 

@@ -5,7 +5,8 @@ use crate::root::Root;
 use anyhow::{Context, Result};
 use clap::Args;
 use gctn::Policy;
-use heightmap::picture;
+use heightmap::Heightmap;
+use heightmap::picture::{self, RgbImage};
 use multiravens::Environment;
 use std::path::PathBuf;
 
@@ -33,7 +34,7 @@ impl Picture {
     pub fn run(self, root: &Root) -> Result<()> {
         let (problem, work_cell) = (root.problem(&self.problem)?, root.work_cell()?);
         std::fs::create_dir_all(&self.out).with_context(|| self.out.display().to_string())?;
-        let write = |name: &str, image| -> Result<()> {
+        let write = |name: &str, image: &RgbImage| -> Result<()> {
             let path = self.out.join(name);
             picture::write(&path, image)?;
             println!("{}", path.display());
@@ -63,7 +64,7 @@ impl Picture {
             .get(earned)
             .copied()
             .context("no reward follows this step: there is no goal")?;
-        let both = |heightmap| {
+        let both = |heightmap: &Heightmap| {
             picture::side_by_side(&[picture::colors(heightmap), picture::heights(heightmap)])
         };
         write("heightmap.png", &both(&step.observation))?;

@@ -31,6 +31,10 @@ const ROOM_M: f64 = 0.01;
 /// Cable left over when it is stretched.
 const SLACK_M: f64 = 0.012;
 const FOOTPRINT_M: (f64, f64) = (0.46, 0.28);
+/// The demonstrator's picks keep this far from a peg's side, ...
+const CUP_ROOM_M: f64 = 8e-3;
+/// ... but no further than this from the bead's centre.
+const MOST_ASIDE_M: f64 = 3e-3;
 /// A bead above this height lies on something.
 const ON_TABLE_M: f64 = 1.5 * BeadChain::BEAD_RADIUS_M;
 
@@ -41,6 +45,12 @@ const SETTINGS: PrimitiveSettings = PrimitiveSettings {
     carry_m_s: 0.15,
     descend_m_s: 0.1,
     acceleration_m_s2: 1.5,
+};
+
+/// For the stretch: lower than the pegs, or the cable would be lifted off the last one.
+const STRETCH: PrimitiveSettings = PrimitiveSettings {
+    lift_m: 0.012,
+    ..SETTINGS
 };
 
 /// Parameters of the module in a problem file.
@@ -101,6 +111,8 @@ struct RoutingTask {
     cable: BeadChain,
     /// Goal of the cable's end, in the module frame.
     end: Point2<f64>,
+    /// Number of pegs routed, in order, when last looked at.
+    routed: usize,
     parameters: Parameters,
 }
 
@@ -183,9 +195,17 @@ impl Routing {
             pegs,
             cable,
             end,
+            routed: 0,
             parameters: self.parameters,
         }
     }
+}
+
+/// Index of the bead nearest to a point.
+fn nearest(point: &Point2<f64>, beads: &[(Point2<f64>, f64)]) -> usize {
+    let distances = beads.iter().map(|(p, _)| (p - point).norm());
+    let nearest = distances.enumerate().min_by(|a, b| a.1.total_cmp(&b.1));
+    nearest.map_or(0, |(index, _)| index)
 }
 
 /// Length of a polyline.
@@ -235,10 +255,14 @@ impl RoutingTask {
             })
             .sum();
         let passed = (0.5 * PI..1.75 * PI).contains(&(-peg.side * sweep));
-        let against = beads
+        passed && self.is_against(peg, beads)
+    }
+
+    /// Whether a bead lies on the table where the cable should pass a peg.
+    fn is_against(&self, peg: &Peg, beads: &[(Point2<f64>, f64)]) -> bool {
+        beads
             .iter()
-            .any(|(p, z)| *z < ON_TABLE_M && (p - peg.pass()).norm() < self.parameters.tolerance_m);
-        passed && against
+            .any(|(p, z)| *z < ON_TABLE_M && (p - peg.pass()).norm() < self.parameters.tolerance_m)
     }
 
     fn is_stretched(&self, beads: &[(Point2<f64>, f64)]) -> bool {
@@ -267,7 +291,11 @@ impl Task for RoutingTask {
     }
 
     fn settings(&self) -> PrimitiveSettings {
-        SETTINGS
+        if self.routed == self.pegs.len() {
+            STRETCH
+        } else {
+            SETTINGS
+        }
     }
 
     fn goal_poses(&self) -> Vec<Isometry3<f64>> {
@@ -286,8 +314,9 @@ impl Task for RoutingTask {
             .pegs
             .iter()
             .take_while(|peg| self.is_routed(peg, &beads));
-        let routed = routed.count();
-        routed + usize::from(routed == self.pegs.len() && self.is_stretched(&beads))
+        self.routed = routed.count();
+        let all = self.routed == self.pegs.len();
+        self.routed + usize::from(all && self.is_stretched(&beads))
     }
 
     /// Lifts the bead that belongs against the next peg over to its side of the peg; when all pegs
@@ -299,25 +328,41 @@ impl Task for RoutingTask {
             .iter()
             .position(|peg| !self.is_routed(peg, &beads));
         let (bead, goal) = match next {
+            // The cable lies right, but its end has folded back: draw it on.
+            Some(next)
+                if next + 1 == self.pegs.len() && self.is_against(&self.pegs[next], &beads) =>
+            {
+                (beads.len() - 1, self.end)
+            }
             Some(next) => {
-                let mut path = vec![Point2::new(ANCHOR_X_M, 0.0)];
-                path.extend(self.pegs[..next].iter().map(Peg::pass));
-                // While the bead is lifted, the cable behind it has to reach up to it.
-                let peg = self.pegs[next].pass() + Vector2::new(0.0, self.pegs[next].side * ROOM_M);
-                let up = SETTINGS.lift_m.hypot((peg - path[path.len() - 1]).norm());
-                let ideal = ((length(&path) + up) / BeadChain::PITCH_M).ceil() as usize;
+                let peg = &self.pegs[next];
+                let goal = peg.pass() + Vector2::new(0.0, peg.side * ROOM_M);
+                // The bead at the peg before, or the anchor.
+                let held = next.checked_sub(1).map_or(0, |last| {
+                    let pass = self.pegs[last].pass();
+                    nearest(&pass, &beads)
+                });
+                // While the bead is lifted, the cable from there has to reach up to it.
+                let way = SETTINGS.lift_m.hypot((goal - beads[held].0).norm());
+                let ideal = held + (way / BeadChain::PITCH_M).ceil() as usize;
                 let ideal = ideal + rng.random_range(0..2);
                 let near = [0, 1, -1, 2, -2, 3].map(|off| ideal.saturating_add_signed(off));
                 let bead = near
                     .into_iter()
                     .find(|bead| (1..beads.len()).contains(bead) && self.can_pick(*bead, &beads))?;
-                let peg = &self.pegs[next];
-                (bead, peg.pass() + Vector2::new(0.0, peg.side * ROOM_M))
+                (bead, goal)
             }
             None if !self.is_stretched(&beads) => (beads.len() - 1, self.end),
             None => return None,
         };
         let noise = Vector2::new(rng.random_range(-1e-3..1e-3), rng.random_range(-1e-3..1e-3));
+        // The cup has to come down beside a peg, not on it.
+        let aside = self.pegs.iter().map(|peg| {
+            let off = beads[bead].0 - peg.center;
+            let missing = (PEG_RADIUS_M + CUP_ROOM_M - off.norm()).clamp(0.0, MOST_ASIDE_M);
+            off.normalize() * missing
+        });
+        let noise = noise + aside.sum::<Vector2<f64>>();
         let pose = |p: Point2<f64>| Isometry2::new((self.anchor * p).coords, 0.0);
         Some(PickPlace {
             pick: pose(beads[bead].0 + noise),

@@ -24,6 +24,9 @@ const EMPTY_FORCE_N: f32 = 5.0;
 /// A tip pushed this far back into the tool counts as contact, whatever pushes: a held bead may
 /// come down on its own neighbour.
 const PUSHED_BACK_M: f32 = 3e-3;
+/// After a release the tool collides again when it has left the place by this much: a cable may
+/// lie round it.
+const LEFT_M: f32 = 0.03;
 /// How far the cup reaches when suction goes on: it may have bounced a little.
 const GRASP_DISTANCE_M: f32 = 1e-3;
 const LINEAR: [JointAxis; 3] = [JointAxis::LinX, JointAxis::LinY, JointAxis::LinZ];
@@ -34,6 +37,8 @@ pub(super) struct Suction {
     tip_collider: ColliderHandle,
     spring: ImpulseJointHandle,
     grip: Option<Grip>,
+    /// Where something was released that the tool may still be among.
+    released_at: Option<Vector>,
 }
 
 struct Grip {
@@ -75,12 +80,29 @@ impl Suction {
             tip_collider,
             spring,
             grip: None,
+            released_at: None,
         }
     }
 
     /// Where the arm brings the head by the end of the next step.
-    pub(super) fn lead(&self, physics: &mut PhysicsWorld, tip: &Isometry3<f64>) {
-        physics.bodies[self.head].set_next_kinematic_position(to_pose(tip));
+    pub(super) fn lead(&mut self, physics: &mut PhysicsWorld, tip: &Isometry3<f64>) {
+        let pose = to_pose(tip);
+        physics.bodies[self.head].set_next_kinematic_position(pose);
+        if let Some(at) = self.released_at
+            && (pose.translation - at).length() > LEFT_M
+        {
+            self.released_at = None;
+            self.collide(physics, true);
+        }
+    }
+
+    fn collide(&self, physics: &mut PhysicsWorld, collides: bool) {
+        let groups = if collides {
+            InteractionGroups::all()
+        } else {
+            InteractionGroups::all().with_filter(Group::NONE)
+        };
+        physics.colliders[self.tip_collider].set_collision_groups(groups);
     }
 
     fn limit_force(&self, physics: &mut PhysicsWorld, newton: f32) {
@@ -117,7 +139,8 @@ impl World {
         let force_n = self.bodies[body.0].suction_force_n;
         self.suction.limit_force(&mut self.physics, force_n);
         // What is held shields the cup.
-        self.set_tip_collides(false);
+        self.suction.released_at = None;
+        self.suction.collide(&mut self.physics, false);
         true
     }
 
@@ -126,7 +149,8 @@ impl World {
         if let Some(grip) = self.suction.grip.take() {
             self.physics.impulse_joints.remove(grip.joint, true);
             self.suction.limit_force(&mut self.physics, EMPTY_FORCE_N);
-            self.set_tip_collides(true);
+            let head = self.physics.bodies[self.suction.head].translation();
+            self.suction.released_at = Some(head);
         }
     }
 
@@ -189,14 +213,5 @@ impl World {
         });
         near.min_by(|a, b| a.0.total_cmp(&b.0))
             .map(|(_, body)| body)
-    }
-
-    fn set_tip_collides(&mut self, collides: bool) {
-        let groups = if collides {
-            InteractionGroups::all()
-        } else {
-            InteractionGroups::all().with_filter(Group::NONE)
-        };
-        self.physics.colliders[self.suction.tip_collider].set_collision_groups(groups);
     }
 }

@@ -403,7 +403,9 @@ impl Node {
         if !self.inner.clock.is_simulated() {
             return Ok(());
         }
-        let mut ticks = self.subscription::<rosgraph_msgs::Clock>("/clock", Qos::Event)?;
+        // Best effort, as rcl has it. A reliable writer would also wait for ros2-client's own readers
+        // of /clock, which have the wrong type and acknowledge nothing.
+        let mut ticks = self.subscription::<rosgraph_msgs::Clock>("/clock", Qos::Image)?;
         let clock = self.inner.clock.clone();
         self.spawn_background(async move {
             loop {

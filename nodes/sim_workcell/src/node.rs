@@ -233,6 +233,7 @@ struct Hardware {
     frames: Vec<Frame>,
     said_pins: IOStates,
     next_status: Instant,
+    next_pins: Instant,
     next_frames: Instant,
 }
 
@@ -268,7 +269,8 @@ impl Hardware {
         let program_running = node.publisher(&status("robot_program_running"), Qos::Latched)?;
         program_running.publish(Bool { data: true });
         Ok(Self {
-            clock: node.publisher("/clock", Qos::Event)?,
+            // Best effort: the readers of /clock that ros2-client makes acknowledge nothing.
+            clock: node.publisher("/clock", Qos::Image)?,
             joint_states: node.publisher("joint_states", Qos::Event)?,
             io_states: node.publisher(&status("io_states"), Qos::Event)?,
             reward: node.publisher("reward", Qos::Event)?,
@@ -286,6 +288,7 @@ impl Hardware {
             _program_running: program_running,
             frames: Vec::new(),
             next_status: Instant::now(),
+            next_pins: Instant::now(),
             next_frames: Instant::now(),
         })
     }
@@ -298,7 +301,7 @@ impl Hardware {
         );
         self.look()?;
         while !self.stop.load(Ordering::Acquire) {
-            let next = self.next_status.min(self.next_frames);
+            let next = self.next_status.min(self.next_pins).min(self.next_frames);
             match self
                 .commands
                 .recv_timeout(next.saturating_duration_since(Instant::now()))
@@ -310,6 +313,8 @@ impl Hardware {
             let now = Instant::now();
             if now >= self.next_status {
                 self.say_status()?;
+            }
+            if now >= self.next_pins {
                 self.say_pins();
             }
             if now >= self.next_frames {
@@ -434,9 +439,8 @@ impl Hardware {
                 next_feedback += FEEDBACK_PERIOD;
                 self.say_feedback(goal, time - begin.1)?;
             }
-            if Instant::now() >= self.next_status {
+            if Instant::now() >= self.next_pins {
                 self.say_pins();
-                self.next_status = self.after(self.parameters.status_period_s);
             }
             self.pace(begin);
         }
@@ -509,6 +513,7 @@ impl Hardware {
     fn say_pins(&mut self) {
         self.said_pins = self.workcell.io_states();
         self.io_states.publish(self.said_pins.clone());
+        self.next_pins = self.after(self.parameters.status_period_s);
     }
 
     fn say_pins_if_changed(&mut self) {

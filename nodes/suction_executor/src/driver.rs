@@ -20,7 +20,7 @@ use tokio::runtime::Handle;
 use tokio::sync::watch;
 use tokio::time::{MissedTickBehavior, interval, timeout};
 use tokio_util::sync::CancellationToken;
-use tracing::warn;
+use tracing::{debug, warn};
 use ur5::{JointTrajectory, Joints};
 
 use crate::parameters::Driver;
@@ -150,6 +150,7 @@ impl DriverRobot {
         planned: Duration,
     ) -> Result<(GoalStatus, A::Result), DriverError> {
         self.check()?;
+        let begin = Instant::now();
         let options = self.link.options();
         let sent = match client.send_goal(goal, &options).await {
             Ok(sent) => sent,
@@ -163,9 +164,13 @@ impl DriverRobot {
                 return Err(DriverError::fault(error));
             }
         };
+        let accepted = begin.elapsed();
         let trouble = tokio::select! {
             end = sent.result() => match end {
-                Ok(end) => return Ok(end),
+                Ok(end) => {
+                    debug!("motion of {planned:?}: accepted after {accepted:?}, ended after {:?}", begin.elapsed());
+                    return Ok(end);
+                }
                 Err(error) => DriverError::fault(error),
             },
             trouble = self.trouble(planned) => trouble,
@@ -251,8 +256,10 @@ impl DriverRobot {
     async fn read_joints(&mut self) -> Result<Joints, DriverError> {
         let called = self.link.origin.elapsed();
         let left = self.left.take();
-        let rest = Duration::from_secs_f64(self.link.parameters.rest_time_s);
         let simulated = self.link.clock.is_simulated();
+        let rest = Duration::from_secs_f64(self.link.parameters.rest_time_s);
+        // A simulator may be slow, and its time may run on.
+        let rest = if simulated { 10 * rest } else { rest };
         let reading = self
             .wait_for("the joints have not come to rest", |status| {
                 let (joints, still) = (status.joints?, status.still?);
@@ -263,6 +270,10 @@ impl DriverRobot {
                 (joints.at >= called && after_motion && at_rest).then_some(joints.value)
             })
             .await?;
+        debug!(
+            "at rest after {:?}",
+            self.link.origin.elapsed().saturating_sub(called)
+        );
         let first = self.stamps.map_or(reading.stamp, |(first, _)| first);
         self.stamps = Some((first, reading.stamp));
         Ok(reading.positions_rad)

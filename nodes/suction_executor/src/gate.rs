@@ -4,6 +4,7 @@
 //! is remembered so that a refusal can say what became of it.
 
 use std::collections::VecDeque;
+use std::sync::Arc;
 use std::time::Duration;
 
 use heightmap::{Heightmap, Workspace};
@@ -11,8 +12,8 @@ use pick_place::{PickPlace, PrimitiveSettings};
 
 use crate::status::DriverStatus;
 
-/// Heightmaps kept, by stamp: a proposal is compared with the one that it was made from.
-const HEIGHTMAPS: usize = 8;
+/// Heightmaps kept, by stamp, until the proposals that were made from them arrive.
+const HEIGHTMAPS: usize = 64;
 /// Proposals whose fate is remembered.
 const PROPOSALS: usize = 1024;
 
@@ -128,13 +129,25 @@ impl Fate {
     }
 }
 
+/// The newest proposal.
+#[derive(Debug)]
+struct Newest {
+    id: u64,
+    /// The proposal, or what is wrong with it.
+    checked: Result<Proposal, String>,
+    /// The heightmap that it was made from, once it has arrived.
+    own: Option<Arc<Heightmap>>,
+}
+
 /// Decides what may move.
 #[derive(Debug)]
 pub struct Gate {
     rules: Rules,
-    heightmaps: VecDeque<(Duration, Heightmap)>,
-    /// The newest proposal, or what is wrong with it.
-    newest: Option<(u64, Result<Proposal, String>)>,
+    /// The first of each stamp, oldest first.
+    heightmaps: VecDeque<(Duration, Arc<Heightmap>)>,
+    /// The newest observation.
+    present: Option<(Duration, Arc<Heightmap>)>,
+    newest: Option<Newest>,
     /// Oldest first; the last is the newest proposal's.
     fates: VecDeque<(u64, Fate)>,
     moving: Option<u64>,
@@ -148,6 +161,7 @@ impl Gate {
         Self {
             rules,
             heightmaps: VecDeque::new(),
+            present: None,
             newest: None,
             fates: VecDeque::new(),
             moving: None,
@@ -162,24 +176,50 @@ impl Gate {
 
     /// Takes the newest observation.
     pub fn observe(&mut self, stamp: Duration, heightmap: Heightmap) {
-        // The same frame may come again.
-        self.heightmaps.retain(|(known, _)| *known != stamp);
-        if self.heightmaps.len() == HEIGHTMAPS {
-            self.heightmaps.pop_front();
+        let known = self.heightmaps.iter().find(|(known, _)| *known == stamp);
+        let heightmap = match known {
+            // The same frame may come again; another of the same stamp is a change.
+            Some((_, known)) if **known == heightmap => Arc::clone(known),
+            Some(_) => Arc::new(heightmap),
+            None => {
+                if self.heightmaps.len() == HEIGHTMAPS {
+                    self.heightmaps.pop_front();
+                }
+                let heightmap = Arc::new(heightmap);
+                self.heightmaps.push_back((stamp, Arc::clone(&heightmap)));
+                heightmap
+            }
+        };
+        self.present = Some((stamp, heightmap));
+        self.find_own();
+    }
+
+    /// Holds on to the heightmap of the newest proposal, however many come after it.
+    fn find_own(&mut self) {
+        if let Some(Newest {
+            checked: Ok(proposal),
+            own: own @ None,
+            ..
+        }) = &mut self.newest
+        {
+            let known = self
+                .heightmaps
+                .iter()
+                .find(|(stamp, _)| *stamp == proposal.stamp);
+            *own = known.map(|(_, heightmap)| Arc::clone(heightmap));
         }
-        self.heightmaps.push_back((stamp, heightmap));
     }
 
     /// Takes a proposal, or what is wrong with the message of that id; it supersedes the one before.
     pub fn propose(&mut self, id: u64, proposal: Result<Proposal, String>) -> Proposed {
         if self.fate(id).is_some() {
-            if let Some((newest, known)) = &mut self.newest
-                && *newest == id
-                && known.is_ok()
-                && !same(known, &proposal)
+            if let Some(newest) = &mut self.newest
+                && newest.id == id
+                && newest.checked.is_ok()
+                && !same(&newest.checked, &proposal)
             {
                 let reason = format!("proposal {id} came twice with different contents");
-                *known = Err(reason.clone());
+                newest.checked = Err(reason.clone());
                 return Proposed::Invalid(reason);
             }
             return Proposed::Repeated;
@@ -197,7 +237,12 @@ impl Gate {
             Ok(_) => Proposed::Open,
             Err(reason) => Proposed::Invalid(reason.clone()),
         };
-        self.newest = Some((id, checked));
+        self.newest = Some(Newest {
+            id,
+            checked,
+            own: None,
+        });
+        self.find_own();
         proposed
     }
 
@@ -245,10 +290,13 @@ impl Gate {
             ));
         }
         // Only the newest proposal is open.
-        let proposal = match &self.newest {
-            Some((newest, Ok(proposal))) if *newest == id => proposal,
-            Some((newest, Err(reason))) if *newest == id => return Verdict::refuse(reason.clone()),
+        let newest = match &self.newest {
+            Some(newest) if newest.id == id => newest,
             _ => return Verdict::refuse(Fate::Superseded.reason(id)),
+        };
+        let proposal = match &newest.checked {
+            Ok(proposal) => proposal,
+            Err(reason) => return Verdict::refuse(reason.clone()),
         };
         if let Some(obstacle) = status.obstacle(now, self.rules.status_max_age) {
             return Verdict::refuse(format!("proposal {id}: {obstacle}"));
@@ -262,7 +310,7 @@ impl Gate {
                 seconds(until)
             ));
         }
-        if let Err(verdict) = self.unchanged(proposal) {
+        if let Err(verdict) = self.unchanged(proposal, newest.own.as_deref()) {
             return verdict;
         }
         if let Err(reason) = plan(status, proposal) {
@@ -303,13 +351,9 @@ impl Gate {
     }
 
     /// Whether the newest heightmap shows what the proposal's own does.
-    fn unchanged(&self, proposal: &Proposal) -> Result<(), Verdict> {
+    fn unchanged(&self, proposal: &Proposal, own: Option<&Heightmap>) -> Result<(), Verdict> {
         let id = proposal.id;
-        let own = self
-            .heightmaps
-            .iter()
-            .find(|(stamp, _)| *stamp == proposal.stamp);
-        let (Some((_, own)), Some((stamp, newest))) = (own, self.heightmaps.back()) else {
+        let (Some(own), Some((stamp, newest))) = (own, &self.present) else {
             return Err(Verdict::Wait(format!(
                 "proposal {id}: the heightmap of {}, which it was made from, has not arrived",
                 seconds(proposal.stamp)
@@ -698,6 +742,29 @@ mod tests {
         // A small change is noise.
         changed.height_m[20..].fill(0.0);
         gate.observe(Duration::from_secs(7), changed);
+        assert!(matches!(approve(&mut gate, 7), Verdict::Move(_)));
+    }
+
+    #[test]
+    fn another_heightmap_of_the_same_stamp_is_a_change() {
+        let mut gate = gate();
+        gate.observe(Duration::from_secs(5), Heightmap::new(Workspace::RAVENS));
+        let mut changed = Heightmap::new(Workspace::RAVENS);
+        changed.height_m[..100].fill(0.02);
+        gate.observe(Duration::from_secs(5), changed);
+        let verdict = approve(&mut gate, 7);
+        assert_refused(&gate, verdict, &["7", "observation has changed"]);
+        gate.observe(Duration::from_secs(5), Heightmap::new(Workspace::RAVENS));
+        assert!(matches!(approve(&mut gate, 7), Verdict::Move(_)));
+    }
+
+    #[test]
+    fn a_slow_operator_may_approve_after_many_observations() {
+        let mut gate = gate();
+        for second in 6..6 + 2 * HEIGHTMAPS as u64 {
+            let stamp = Duration::from_secs(second);
+            gate.observe(stamp, Heightmap::new(Workspace::RAVENS));
+        }
         assert!(matches!(approve(&mut gate, 7), Verdict::Move(_)));
     }
 

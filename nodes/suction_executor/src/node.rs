@@ -14,7 +14,7 @@ use msgs::std_msgs::Bool;
 use msgs::ur_dashboard_msgs::{RobotMode, SafetyMode};
 use msgs::ur_msgs::{Digital, IOStates};
 use node_kit::{Level, Node, Publisher, Qos, Subscription};
-use pick_place::{ExecuteError, Outcome, Phase};
+use pick_place::{ExecuteError, Outcome, Phase, PickPlace};
 use tokio::runtime::Handle;
 use tokio::sync::watch;
 use tokio::task::JoinHandle;
@@ -230,8 +230,7 @@ impl Executor {
 
     fn on_proposal(&mut self, message: sctn_msgs::PickPlace) {
         let id = message.id;
-        let proposal = read_proposal(&message).map_err(|error| format!("proposal {id}: {error}"));
-        match self.gate.propose(id, proposal) {
+        match self.gate.propose(id, read_proposal(&message)) {
             Proposed::Open => {
                 info!("proposal {id}");
                 if self.automatic {
@@ -474,13 +473,20 @@ async fn sleep_until(deadline: Option<Instant>) {
     }
 }
 
-fn read_proposal(message: &sctn_msgs::PickPlace) -> Result<Proposal, ConvertError> {
+/// Says what is wrong with a message and in which field.
+fn read_proposal(message: &sctn_msgs::PickPlace) -> Result<Proposal, String> {
+    let id = message.id;
+    let of =
+        |field: &'static str| move |error: ConvertError| format!("proposal {id}: {field}.{error}");
     Ok(Proposal {
-        id: message.id,
+        id,
         frame: message.header.frame_id.clone(),
-        stamp: convert::time_from_msg(&message.header.stamp)?,
-        action: convert::pick_place_from_msg(message)?,
-        settings: convert::settings_from_msg(&message.settings)?,
+        stamp: convert::time_from_msg(&message.header.stamp).map_err(of("header"))?,
+        action: PickPlace {
+            pick: convert::pose2d_from_msg(&message.pick).map_err(of("pick"))?,
+            place: convert::pose2d_from_msg(&message.place).map_err(of("place"))?,
+        },
+        settings: convert::settings_from_msg(&message.settings).map_err(of("settings"))?,
     })
 }
 

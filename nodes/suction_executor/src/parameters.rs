@@ -61,7 +61,8 @@ pub struct Driver {
     pub reading_timeout_s: f64,
     /// Joints slower than this stand still.
     pub rest_speed_rad_s: f64,
-    /// Wall seconds that joints have to stand still to count as at rest.
+    /// Wall seconds that joints have to stand still to count as at rest; ten times that in simulated
+    /// time that does not stand still with them.
     pub rest_time_s: f64,
     /// Largest deviation on the way that is asked of the controller.
     pub path_tolerance_rad: f64,

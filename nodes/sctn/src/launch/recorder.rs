@@ -45,7 +45,7 @@ impl Recorder {
         topics.record::<Reward>("reward", Qos::Event, true)?;
         topics.record::<JointState>("joint_states", Qos::Event, false)?;
         topics.record::<TFMessage>("/tf_static", Qos::Latched, false)?;
-        topics.record::<Clock>("/clock", Qos::Event, false)?;
+        topics.record::<Clock>("/clock", Qos::Image, false)?;
         for camera in CAMERAS.into_iter().filter(|_| images) {
             topics.record::<Image>(&format!("{camera}/color/image_raw"), Qos::Image, false)?;
             topics.record::<Image>(&format!("{camera}/depth/image_rect_raw"), Qos::Image, false)?;

@@ -1,0 +1,518 @@
+//! The executor and the simulated cell over DDS, with this test in place of fusion, policy and operator.
+
+use std::collections::BTreeMap;
+use std::future::Future;
+use std::net::UdpSocket;
+use std::path::Path;
+use std::sync::atomic::{AtomicU16, Ordering};
+use std::time::{Duration, Instant};
+
+use heightmap::{Camera, Fusion, Heightmap, View, Workspace};
+use msgs::convert;
+use msgs::sctn_msgs::{self, Reward, StepConfirmation, StepResult};
+use msgs::sensor_msgs::{CameraInfo, Image, JointState};
+use msgs::tf2_msgs::TFMessage;
+use msgs::ur_dashboard_msgs::SafetyMode;
+use multiravens::{Environment, Problem};
+use nalgebra::Isometry3;
+use node_kit::{Context, Network, Node, Parameters, Publisher, Qos, RosArguments, Subscription};
+use pick_place::{PickPlace, PrimitiveSettings};
+use serde::{Deserialize, Serialize};
+use ur5::WorkCell;
+
+const SEED: u64 = 10_000;
+const CAMERAS: [&str; 3] = ["front", "left", "right"];
+const PATIENCE: Duration = Duration::from_secs(60);
+
+fn problems_dir() -> std::path::PathBuf {
+    Path::new(env!("CARGO_MANIFEST_DIR")).join("../../config/problems")
+}
+
+/// A domain whose discovery ports nobody on this machine has.
+fn free_domain() -> u16 {
+    static NEXT: AtomicU16 = AtomicU16::new(0);
+    let start = std::process::id() as u16 % 100 + 7 * NEXT.fetch_add(1, Ordering::Relaxed);
+    (0..100)
+        .map(|offset| 1 + (start + offset) % 100)
+        .find(|domain| {
+            let first = 7400 + 250 * domain;
+            (first..first + 2)
+                .chain(first + 10..first + 20)
+                .all(|port| UdpSocket::bind(("0.0.0.0", port)).is_ok())
+        })
+        .expect("a free domain")
+}
+
+#[derive(Default, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+struct NoParameters {}
+impl Parameters for NoParameters {}
+
+fn arguments(parameters: &[(&str, String)]) -> RosArguments {
+    let mut line = vec!["--ros-args".to_owned()];
+    for (name, value) in parameters {
+        line.extend(["-p".to_owned(), format!("{name}:={value}")]);
+    }
+    RosArguments::parse(line).unwrap().0
+}
+
+async fn within<T>(what: &str, future: impl Future<Output = T>) -> T {
+    tokio::time::timeout(PATIENCE, future)
+        .await
+        .unwrap_or_else(|_| panic!("no {what} within {PATIENCE:?}"))
+}
+
+/// The nodes under test on a domain of their own, and everybody else.
+struct Bench {
+    sim: Context,
+    executor: Context,
+    node: Node,
+    heightmaps: Publisher<sctn_msgs::Heightmap>,
+    proposals: Publisher<sctn_msgs::PickPlace>,
+    confirmations: Publisher<StepConfirmation>,
+    safety_mode: Publisher<SafetyMode>,
+    results: Subscription<StepResult>,
+    rewards: Subscription<Reward>,
+    joint_states: Subscription<JointState>,
+    transforms: Subscription<TFMessage>,
+    poses: BTreeMap<String, Isometry3<f64>>,
+    color: BTreeMap<&'static str, Subscription<Image>>,
+    depth: BTreeMap<&'static str, Subscription<Image>>,
+    info: BTreeMap<&'static str, Subscription<CameraInfo>>,
+}
+
+impl Bench {
+    async fn start(sim: &[(&str, String)], executor: &[(&str, String)]) -> Self {
+        if let Ok(level) = std::env::var("TEST_LOG_LEVEL") {
+            // Once for all tests of the process.
+            let _ = node_kit::logging::init(&[level]);
+        }
+        let network = Network {
+            domain_id: free_domain(),
+            localhost_only: true,
+        };
+        let own = Context::new(network);
+        let (node, _) = own
+            .node::<NoParameters>("bench", &RosArguments::default())
+            .unwrap();
+        let per_camera = |topic: &str| CAMERAS.map(|camera| (camera, format!("{camera}/{topic}")));
+        let images = |topic| {
+            let topics = per_camera(topic).into_iter();
+            topics
+                .map(|(camera, topic)| (camera, node.subscription(&topic, Qos::Image).unwrap()))
+                .collect()
+        };
+        let bench = Self {
+            heightmaps: node.publisher("heightmap", Qos::Latched).unwrap(),
+            proposals: node.publisher("pick_place", Qos::Event).unwrap(),
+            confirmations: node.publisher("step_confirmation", Qos::Event).unwrap(),
+            safety_mode: node
+                .publisher("io_and_status_controller/safety_mode", Qos::Latched)
+                .unwrap(),
+            results: node.subscription("step_result", Qos::Event).unwrap(),
+            rewards: node.subscription("reward", Qos::Event).unwrap(),
+            joint_states: node.subscription("joint_states", Qos::Event).unwrap(),
+            transforms: node.subscription("/tf_static", Qos::Latched).unwrap(),
+            poses: BTreeMap::new(),
+            color: images("color/image_raw"),
+            depth: images("depth/image_rect_raw"),
+            info: per_camera("color/camera_info")
+                .into_iter()
+                .map(|(camera, topic)| (camera, node.subscription(&topic, Qos::Event).unwrap()))
+                .collect(),
+            sim: Context::new(network),
+            executor: Context::new(network),
+            node,
+        };
+        let common = |more: &[(&'static str, String)], given: &[(&str, String)]| {
+            let mut all = vec![("use_sim_time", "true".to_owned())];
+            all.extend_from_slice(more);
+            let mut all: Vec<(String, String)> =
+                all.into_iter().map(|(n, v)| (n.to_owned(), v)).collect();
+            all.extend(given.iter().map(|(n, v)| ((*n).to_owned(), v.clone())));
+            let all: Vec<(&str, String)> =
+                all.iter().map(|(n, v)| (n.as_str(), v.clone())).collect();
+            arguments(&all)
+        };
+        let scene = [
+            ("problems_dir", problems_dir().display().to_string()),
+            ("seed", SEED.to_string()),
+        ];
+        bench
+            .sim
+            .start("sim_workcell", &common(&scene, sim), sim_workcell::run)
+            .unwrap();
+        bench
+            .executor
+            .start(
+                "suction_executor",
+                &common(&[], executor),
+                suction_executor::run,
+            )
+            .unwrap();
+        let graph = bench.node.graph();
+        for topic in [
+            bench.proposals.topic(),
+            bench.confirmations.topic(),
+            bench.heightmaps.topic(),
+        ] {
+            assert!(
+                graph.wait_for_subscription(topic, PATIENCE).await,
+                "nobody listens to {topic}"
+            );
+        }
+        assert!(graph.wait_for_publisher("/step_result", PATIENCE).await);
+        // Both ends have to have seen each other.
+        tokio::time::sleep(Duration::from_secs(2)).await;
+        bench
+    }
+
+    async fn stop(self) {
+        self.executor.shutdown();
+        self.sim.shutdown();
+        self.node.stop();
+        tokio::time::sleep(Duration::from_millis(100)).await;
+    }
+
+    /// What the cameras show at a time.
+    async fn look(&mut self, time: Duration) -> Heightmap {
+        let stamp = convert::time_to_msg(time).unwrap();
+        if self.poses.is_empty() {
+            let message = within("tf_static", self.transforms.recv()).await;
+            let pose = |t: &msgs::geometry_msgs::TransformStamped| {
+                convert::isometry_from_msg(&t.transform).unwrap()
+            };
+            self.poses = message
+                .transforms
+                .iter()
+                .map(|t| (t.child_frame_id.clone(), pose(t)))
+                .collect();
+        }
+        let mut views = Vec::new();
+        for name in CAMERAS {
+            let info = within(
+                "camera_info",
+                newest(self.info.get_mut(name).unwrap(), |m| {
+                    m.header.stamp == stamp
+                }),
+            )
+            .await;
+            let color = within(
+                "colour",
+                newest(self.color.get_mut(name).unwrap(), |m| {
+                    m.header.stamp == stamp
+                }),
+            )
+            .await;
+            let depth = within(
+                "depth",
+                newest(self.depth.get_mut(name).unwrap(), |m| {
+                    m.header.stamp == stamp
+                }),
+            )
+            .await;
+            let intrinsics = convert::intrinsics_from_msg(&info).unwrap();
+            let (mut rgb, mut depth_m) = (Vec::new(), Vec::new());
+            convert::color_from_msg(&color, &intrinsics, &mut rgb).unwrap();
+            convert::depth_from_msg(&depth, &intrinsics, &mut depth_m).unwrap();
+            let world_from_camera = self.poses[&info.header.frame_id];
+            views.push((
+                Camera {
+                    name: name.into(),
+                    intrinsics,
+                    world_from_camera,
+                },
+                rgb,
+                depth_m,
+            ));
+        }
+        let views: Vec<View<'_>> = views
+            .iter()
+            .map(|(camera, rgb, depth_m)| View {
+                camera,
+                rgb,
+                depth_m,
+            })
+            .collect();
+        let mut heightmap = Heightmap::new(Workspace::RAVENS);
+        Fusion::default().fuse(&views, &mut heightmap).unwrap();
+        heightmap
+    }
+
+    fn observe(&self, heightmap: &Heightmap, time: Duration) {
+        let header = convert::header(time, "world").unwrap();
+        self.heightmaps
+            .publish(convert::heightmap_to_msg(heightmap.clone(), header, 3, 1.0).unwrap());
+    }
+
+    fn propose(&self, id: u64, time: Duration, action: &PickPlace, settings: &PrimitiveSettings) {
+        self.proposals.publish(sctn_msgs::PickPlace {
+            header: convert::header(time, "world").unwrap(),
+            id,
+            pick: convert::pose2d_to_msg(&action.pick),
+            place: convert::pose2d_to_msg(&action.place),
+            settings: convert::settings_to_msg(settings),
+            ..Default::default()
+        });
+    }
+
+    fn decide(&self, proposal_id: u64, decision: u8) {
+        self.confirmations.publish(StepConfirmation {
+            proposal_id,
+            decision,
+            operator_name: "test".into(),
+            ..Default::default()
+        });
+    }
+
+    async fn result(&mut self) -> StepResult {
+        within("step_result", self.results.recv()).await
+    }
+
+    async fn joints(&mut self) -> JointState {
+        while self.joint_states.try_recv().is_some() {}
+        within("joint_states", self.joint_states.recv()).await
+    }
+
+    /// Waits until the arm has left where it was.
+    async fn until_moving(&mut self) {
+        let before = self.joints().await;
+        loop {
+            let now = within("joint_states", self.joint_states.recv()).await;
+            if now.position != before.position {
+                return;
+            }
+        }
+    }
+}
+
+async fn newest<M: msgs::Interface>(
+    subscription: &mut Subscription<M>,
+    accept: impl Fn(&M) -> bool,
+) -> M {
+    loop {
+        let message = subscription.recv().await;
+        if accept(&message) {
+            return message;
+        }
+    }
+}
+
+fn reference() -> Environment {
+    let problem = Problem::load(&problems_dir(), "placing").unwrap();
+    let mut environment = Environment::new(&problem, &WorkCell::builtin().unwrap());
+    environment.reset(SEED).unwrap();
+    environment
+}
+
+/// A bench that has seen the start of the episode, with the demonstrator's first action as proposal 1.
+async fn proposed(
+    sim: &[(&str, String)],
+    executor: &[(&str, String)],
+) -> (Bench, Environment, Heightmap) {
+    let mut environment = reference();
+    let mut bench = Bench::start(sim, executor).await;
+    let time = environment.cell().time();
+    let heightmap = bench.look(time).await;
+    bench.observe(&heightmap, time);
+    let action = environment.demonstrate().unwrap();
+    bench.propose(1, time, &action, &environment.settings().unwrap());
+    (bench, environment, heightmap)
+}
+
+/// A second of wall time in which the arm takes its time.
+fn slow() -> Vec<(&'static str, String)> {
+    vec![("real_time_factor", "1.0".to_owned())]
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn an_episode_over_dds_is_the_episode_in_process_bit_for_bit() {
+    let mut environment = reference();
+    let mut bench = Bench::start(&[], &[]).await;
+    let begin = Instant::now();
+    for id in 1.. {
+        let time = environment.cell().time();
+        let seen = bench.look(time).await;
+        assert!(
+            seen == *environment.observe().unwrap(),
+            "heightmap of step {id} differs"
+        );
+        let Some(action) = environment.demonstrate() else {
+            assert!(environment.is_complete());
+            break;
+        };
+        let settings = environment.settings().unwrap();
+        bench.observe(&seen, time);
+        bench.propose(id, time, &action, &settings);
+        bench.decide(id, StepConfirmation::APPROVE);
+        let expected = environment.step(&action).unwrap();
+
+        let result = bench.result().await;
+        assert_eq!(
+            (result.proposal_id, result.outcome),
+            (id, StepResult::PLACED),
+            "{}",
+            result.reason
+        );
+        assert_eq!(
+            convert::time_from_msg(&result.header.stamp).unwrap(),
+            expected.time
+        );
+        assert_eq!(
+            convert::duration_from_msg(&result.duration).unwrap(),
+            expected.time - time
+        );
+        let reward = within("reward", bench.rewards.recv()).await;
+        assert_eq!(
+            convert::time_from_msg(&reward.header.stamp).unwrap(),
+            expected.time
+        );
+        assert_eq!(reward.delta.to_bits(), expected.delta_reward.to_bits());
+        assert_eq!(reward.total.to_bits(), expected.total_reward.to_bits());
+        assert_eq!(reward.complete, expected.complete);
+        println!(
+            "step {id}: {:?} of simulated time, {:?} in all",
+            expected.time - time,
+            begin.elapsed()
+        );
+    }
+    bench.stop().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_stop_stops_the_arm_and_it_goes_on_neither_by_itself_nor_on_the_old_approval() {
+    let (mut bench, environment, _) = proposed(&slow(), &[]).await;
+    bench.decide(1, StepConfirmation::APPROVE);
+    bench.until_moving().await;
+    bench.decide(1, StepConfirmation::STOP);
+    let result = bench.result().await;
+    assert_eq!(
+        (result.proposal_id, result.outcome),
+        (1, StepResult::STOPPED),
+        "{}",
+        result.reason
+    );
+    let stopped = bench.joints().await;
+    let home = environment.cell().work_cell().arm.home;
+    assert!(stopped.position != home.iter().copied().collect::<Vec<_>>());
+    bench.decide(1, StepConfirmation::APPROVE);
+    let result = bench.result().await;
+    assert_eq!(result.outcome, StepResult::REFUSED);
+    assert!(
+        result.reason.contains("already carried out"),
+        "{}",
+        result.reason
+    );
+    tokio::time::sleep(Duration::from_secs(1)).await;
+    assert_eq!(bench.joints().await.position, stopped.position);
+    bench.stop().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_protective_stop_is_a_fault_and_nothing_moves_until_it_is_over() {
+    let (mut bench, environment, heightmap) = proposed(&slow(), &[]).await;
+    bench.decide(1, StepConfirmation::APPROVE);
+    bench.until_moving().await;
+    bench.safety_mode.publish(SafetyMode {
+        mode: SafetyMode::PROTECTIVE_STOP,
+    });
+    let result = bench.result().await;
+    assert_eq!(
+        (result.proposal_id, result.outcome),
+        (1, StepResult::FAULT),
+        "{}",
+        result.reason
+    );
+    assert!(
+        result.reason.contains("PROTECTIVE_STOP"),
+        "{}",
+        result.reason
+    );
+    let stopped = bench.joints().await;
+    // A new observation and approval are not enough while it lasts, ...
+    let time = convert::time_from_msg(&result.header.stamp).unwrap() + Duration::from_secs(1);
+    bench.observe(&heightmap, time);
+    bench.propose(
+        2,
+        time,
+        &reference().demonstrate().unwrap(),
+        &environment.settings().unwrap(),
+    );
+    bench.decide(2, StepConfirmation::APPROVE);
+    let result = bench.result().await;
+    assert_eq!(
+        (result.proposal_id, result.outcome),
+        (2, StepResult::REFUSED)
+    );
+    assert!(
+        result.reason.contains("PROTECTIVE_STOP"),
+        "{}",
+        result.reason
+    );
+    assert_eq!(bench.joints().await.position, stopped.position);
+    // ... and when it is over the arm waits for a word.
+    bench.safety_mode.publish(SafetyMode {
+        mode: SafetyMode::NORMAL,
+    });
+    tokio::time::sleep(Duration::from_secs(1)).await;
+    assert_eq!(bench.joints().await.position, stopped.position);
+    bench.decide(2, StepConfirmation::APPROVE);
+    bench.until_moving().await;
+    bench.stop().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_lost_driver_is_a_fault() {
+    let status_max_age = vec![("driver.status_max_age_s", "0.5".to_owned())];
+    let (mut bench, _, _) = proposed(&slow(), &status_max_age).await;
+    bench.decide(1, StepConfirmation::APPROVE);
+    bench.until_moving().await;
+    bench.sim.shutdown();
+    let result = bench.result().await;
+    assert_eq!(
+        (result.proposal_id, result.outcome),
+        (1, StepResult::FAULT),
+        "{}",
+        result.reason
+    );
+    assert!(!result.reason.is_empty());
+    bench.stop().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn without_require_approval_a_proposal_moves_once_by_itself_until_a_stop() {
+    let automatic = vec![("require_approval", "false".to_owned())];
+    let (mut bench, mut environment, _) = proposed(&[], &automatic).await;
+    let action = reference().demonstrate().unwrap();
+    let expected = environment.step(&action).unwrap();
+    let result = bench.result().await;
+    assert_eq!(
+        (result.proposal_id, result.outcome),
+        (1, StepResult::PLACED),
+        "{}",
+        result.reason
+    );
+    assert_eq!(
+        convert::time_from_msg(&result.header.stamp).unwrap(),
+        expected.time
+    );
+    // The same message once more moves nothing.
+    let before = bench.joints().await.position;
+    bench.propose(1, Duration::ZERO, &action, &environment.settings().unwrap());
+    tokio::time::sleep(Duration::from_secs(1)).await;
+    assert_eq!(bench.joints().await.position, before);
+    // Nor does anything by itself after a stop.
+    bench.decide(1, StepConfirmation::STOP);
+    tokio::time::sleep(Duration::from_millis(500)).await;
+    let seen = bench.look(expected.time).await;
+    bench.observe(&seen, expected.time);
+    bench.propose(
+        2,
+        expected.time,
+        &environment.demonstrate().unwrap(),
+        &environment.settings().unwrap(),
+    );
+    tokio::time::sleep(Duration::from_secs(2)).await;
+    assert_eq!(bench.joints().await.position, before);
+    bench.stop().await;
+}

@@ -33,6 +33,10 @@ impl Intrinsics {
     };
 
     /// Number of pixels.
+    #[allow(
+        clippy::len_without_is_empty,
+        reason = "an image without pixels is none"
+    )]
     pub const fn len(&self) -> usize {
         self.width * self.height
     }
@@ -164,5 +168,82 @@ impl Camera {
             );
             (image, point.z)
         })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    #[test]
+    fn the_optical_axes_of_ravens_meet_the_table_where_published() {
+        let hits = [(0.25, 0.0), (0.445, 0.055), (0.445, -0.055)];
+        let quaternions = [
+            [0.65328, 0.65328, -0.2706, -0.2706],
+            [-0.3596, 0.86816, -0.31599, 0.13089],
+            [-0.86816, 0.3596, -0.13089, 0.31599],
+        ];
+        for ((camera, (x_m, y_m)), xyzw) in Camera::ravens().iter().zip(hits).zip(quaternions) {
+            let center = Point2::new(320.0, 240.0);
+            let (eye, ahead) = (
+                camera.back_project(&center, 0.0),
+                camera.back_project(&center, 1.0),
+            );
+            let hit = eye + (ahead - eye) * (eye.z / (eye.z - ahead.z));
+            let expected = Point3::new(x_m, y_m, 0.0);
+            assert!((hit - expected).amax() < 5e-4, "{}: {hit}", camera.name);
+            // The lower edge of the image is nearer than the upper one: the camera is not upside down.
+            let below = camera.back_project(&Point2::new(320.0, 480.0), 1.0);
+            assert!(below.z < ahead.z, "{}", camera.name);
+            let published = UnitQuaternion::from_quaternion(nalgebra::Quaternion::new(
+                xyzw[3], xyzw[0], xyzw[1], xyzw[2],
+            ));
+            let angle_rad = camera.world_from_camera.rotation.angle_to(&published);
+            assert!(angle_rad < 1e-4, "{}: {angle_rad}", camera.name);
+        }
+    }
+
+    #[test]
+    fn a_camera_without_sense_is_refused_by_name_and_parameter() {
+        let good = Camera::ravens()[0].clone();
+        assert_eq!(good.check(), Ok(()));
+        let with = |change: fn(&mut Camera)| {
+            let mut camera = good.clone();
+            change(&mut camera);
+            camera.check().unwrap_err().to_string()
+        };
+        let refusals = [
+            (with(|c| c.intrinsics.width = 0), "the width is 0"),
+            (with(|c| c.intrinsics.height = 1 << 20), "the height is"),
+            (with(|c| c.intrinsics.fx_px = f64::NAN), "fx is NaN"),
+            (with(|c| c.intrinsics.fy_px = -1.0), "fy is -1"),
+            (with(|c| c.intrinsics.cx_px = f64::INFINITY), "cx is inf"),
+            (with(|c| c.intrinsics.cy_px = f64::NAN), "cy is NaN"),
+            (
+                with(|c| c.world_from_camera.translation.x = f64::NAN),
+                "the pose",
+            ),
+        ];
+        for (refusal, part) in refusals {
+            assert!(
+                refusal.contains("front") && refusal.contains(part),
+                "{refusal}"
+            );
+        }
+    }
+
+    proptest! {
+        #[test]
+        fn projection_undoes_back_projection(
+            u_px in 0.0..640.0, v_px in 0.0..480.0, depth_m in 0.01..10.0, which in 0usize..3,
+        ) {
+            let camera = &Camera::ravens()[which];
+            let image = Point2::new(u_px, v_px);
+            let (again, depth_again_m) = camera.project(&camera.back_project(&image, depth_m)).unwrap();
+            prop_assert!((again - image).amax() < 1e-8);
+            prop_assert!((depth_again_m - depth_m).abs() < 1e-10);
+            prop_assert_eq!(camera.project(&camera.back_project(&image, -depth_m)), None);
+        }
     }
 }

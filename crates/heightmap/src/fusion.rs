@@ -1,6 +1,6 @@
 //! Fusion of RGB-D views into a heightmap.
 
-use crate::{Camera, Heightmap, Intrinsics, Workspace};
+use crate::{Camera, CameraError, Heightmap, Intrinsics, Workspace, WorkspaceError};
 use nalgebra::Vector3;
 
 /// More views would overflow the sums of colours.
@@ -26,9 +26,15 @@ pub struct FusionReport {
     pub coverage: f64,
 }
 
-/// A view that does not fit its camera.
+/// Why views cannot be fused.
 #[derive(Debug, thiserror::Error, PartialEq)]
 pub enum FusionError {
+    /// A camera cannot have taken the view.
+    #[error(transparent)]
+    Camera(#[from] CameraError),
+    /// The heightmap to be filled covers nothing.
+    #[error(transparent)]
+    Workspace(#[from] WorkspaceError),
     /// An image has another size than its camera's.
     #[error("camera {camera}: {what} has {actual} elements, expected {expected}")]
     Size {
@@ -52,14 +58,19 @@ pub enum FusionError {
 /// Fuses views; owns the scratch memory so that a fusion allocates nothing.
 #[derive(Debug, Default)]
 pub struct Fusion {
-    /// Highest point of each cell in the present view, packed so that the maximum is one comparison:
-    /// ordered bits of the height above, colour below. One more slot takes what falls off the grid.
+    /// View after view, the highest point of each cell, packed so that the maximum is one comparison:
+    /// ordered bits of the height above, colour below. 0 where the view saw nothing.
     highest: Vec<u64>,
-    /// Per cell: sum of each colour, and the number of views that saw it.
-    colors: Vec<[u16; 4]>,
-    /// Slot and ordered height bits of each pixel of an image row.
-    row: Vec<(u32, u32)>,
+    /// Cell of each pixel of an image row, or [`OUTSIDE`].
+    cells: Vec<u32>,
+    /// Ordered bits of the height of each pixel of an image row.
+    heights: Vec<u32>,
+    /// 0, 1, 2, ...
+    columns: Vec<f32>,
 }
+
+/// The cell of points off the grid.
+const OUTSIDE: u32 = u32::MAX;
 
 impl Fusion {
     /// Highest point per cell wins; colour is the mean over the views that saw the cell
@@ -69,6 +80,7 @@ impl Fusion {
         views: &[View<'_>],
         out: &mut Heightmap,
     ) -> Result<FusionReport, FusionError> {
+        out.workspace.check()?;
         for view in views {
             view.check()?;
         }
@@ -82,55 +94,43 @@ impl Fusion {
             rgb,
             height_m,
         } = out;
-        let cells = workspace.len();
-        rgb.resize(3 * cells, 0);
-        height_m.resize(cells, 0.0);
-        height_m.fill(f32::NEG_INFINITY);
-        self.colors.clear();
-        self.colors.resize(cells, [0; 4]);
-        for view in views {
-            self.project(view, workspace);
-            let seen = self.highest[..cells]
-                .iter()
-                .zip(&mut *height_m)
-                .zip(&mut self.colors);
-            for ((&key, height_m), color) in seen {
-                if key == 0 {
-                    continue;
-                }
-                *height_m = height_m.max(from_ordered((key >> 32) as u32));
-                let [blue, green, red, _] = (key as u32).to_le_bytes().map(u16::from);
-                *color = [
-                    color[0] + red,
-                    color[1] + green,
-                    color[2] + blue,
-                    color[3] + 1,
-                ];
-            }
+        let len = workspace.len();
+        rgb.resize(3 * len, 0);
+        height_m.resize(len, 0.0);
+        self.highest.clear();
+        self.highest.resize(len * views.len(), 0);
+        for (index, view) in views.iter().enumerate() {
+            self.project(index, view, workspace);
         }
         let mut seen = 0;
-        let pixels = rgb.chunks_exact_mut(3).zip(height_m).zip(&self.colors);
-        for ((pixel, height_m), &[red, green, blue, views]) in pixels {
+        for (cell, (pixel, height_m)) in rgb.chunks_exact_mut(3).zip(height_m).enumerate() {
+            let (mut highest, mut sums, mut views) = (0, [0; 3], 0);
+            for index in (cell..self.highest.len()).step_by(len) {
+                let key = self.highest[index];
+                highest = key.max(highest);
+                let [_, red, green, blue] = (key as u32).to_be_bytes().map(u32::from);
+                sums = [sums[0] + red, sums[1] + green, sums[2] + blue];
+                views += u32::from(key != 0);
+            }
             if views == 0 {
                 pixel.fill(0);
                 *height_m = 0.0;
                 continue;
             }
             seen += 1;
-            let mean = |sum: u16| ((sum + views / 2) / views) as u8;
-            pixel.copy_from_slice(&[mean(red), mean(green), mean(blue)]);
+            pixel.copy_from_slice(&mean(sums, views));
+            *height_m = from_ordered((highest >> 32) as u32);
         }
         Ok(FusionReport {
             views: views.len(),
-            coverage: seen as f64 / cells.max(1) as f64,
+            coverage: seen as f64 / len as f64,
         })
     }
 
     /// Finds the highest point of each cell in one view.
-    fn project(&mut self, view: &View<'_>, workspace: &Workspace) {
-        let cells = workspace.len();
-        self.highest.clear();
-        self.highest.resize(cells + 1, 0);
+    fn project(&mut self, index: usize, view: &View<'_>, workspace: &Workspace) {
+        let len = workspace.len();
+        let highest = &mut self.highest[index * len..][..len];
         let Intrinsics {
             width,
             height,
@@ -139,7 +139,10 @@ impl Fusion {
             cx_px,
             cy_px,
         } = view.camera.intrinsics;
-        self.row.resize(width, (0, 0));
+        self.cells.resize(width, 0);
+        self.heights.resize(width, 0);
+        self.columns.clear();
+        self.columns.extend((0..width).map(|u| u as f32));
         // In units of cells, from the grid's corner; z stays in metres. A pixel (u, v) at depth d lies at
         // d (u per_column + start_of_row(v)) + origin.
         let scale = 1.0 / workspace.pixel_size_m;
@@ -155,8 +158,9 @@ impl Fusion {
             let start = Vector3::new(-cx_px / fx_px, (v as f64 - cy_px) / fy_px, 1.0);
             let start = to_cells(pose.rotation * start).cast::<f32>();
             let depths = &view.depth_m[v * width..][..width];
-            for (u, (slot, &depth_m)) in self.row.iter_mut().zip(depths).enumerate() {
-                let u = u as f32;
+            // Two loops, since this one can be done for several pixels at once and the next cannot.
+            let row = self.cells.iter_mut().zip(&mut self.heights);
+            for (((cell, ordered_z), &depth_m), &u) in row.zip(depths).zip(&self.columns) {
                 let x = depth_m * (u * per_column.x + start.x) + origin.x;
                 let y = depth_m * (u * per_column.y + start.y) + origin.y;
                 let z_m = depth_m * (u * per_column.z + start.z) + origin.z;
@@ -168,20 +172,50 @@ impl Fusion {
                     & (y < rows)
                     & (z_m >= z_min_m)
                     & (z_m <= z_max_m);
-                let cell = (y as u32)
-                    .wrapping_mul(workspace.cols as u32)
-                    .wrapping_add(x as u32);
-                *slot = (if inside { cell } else { cells as u32 }, ordered(z_m));
+                let index = whole(floor(y) * cols + floor(x));
+                *cell = if inside { index } else { OUTSIDE };
+                *ordered_z = ordered(z_m);
             }
             let colors = view.rgb[3 * v * width..][..3 * width].chunks_exact(3);
-            for (&(slot, z), color) in self.row.iter().zip(colors) {
-                let color = u32::from_le_bytes([color[2], color[1], color[0], 0]);
-                let key = u64::from(z) << 32 | u64::from(color);
-                let highest = &mut self.highest[slot as usize];
-                *highest = key.max(*highest);
+            for ((&cell, &z), color) in self.cells.iter().zip(&self.heights).zip(colors) {
+                if let Some(highest) = highest.get_mut(cell as usize) {
+                    let color = u32::from_be_bytes([0, color[0], color[1], color[2]]);
+                    *highest = ((u64::from(z) << 32) | u64::from(color)).max(*highest);
+                }
             }
         }
     }
+}
+
+/// A float as large as this has no bits left for fractions.
+const NO_FRACTION: f32 = (1 << 23) as f32;
+
+/// Rounds down; for numbers from 0 to 2^22. Unlike `f32::floor` and `as` it needs nothing that
+/// the oldest x86-64 lacks, so that the compiler can do several at once.
+fn floor(x: f32) -> f32 {
+    let nearest = (x + NO_FRACTION) - NO_FRACTION;
+    nearest - if nearest > x { 1.0 } else { 0.0 }
+}
+
+/// A whole number from 0 to 2^22 as an integer.
+fn whole(x: f32) -> u32 {
+    (x + NO_FRACTION).to_bits() & 0x7f_ffff
+}
+
+/// Sums divided by a number of views, rounded. Multiplies by the reciprocal, which is exact for the
+/// sums of up to [`MAX_VIEWS`] bytes.
+fn mean(sums: [u32; 3], views: u32) -> [u8; 3] {
+    const RECIPROCALS: [u64; MAX_VIEWS + 1] = {
+        let mut reciprocals = [0; MAX_VIEWS + 1];
+        let mut views = 1;
+        while views <= MAX_VIEWS {
+            reciprocals[views] = (1u64 << 32).div_ceil(views as u64);
+            views += 1;
+        }
+        reciprocals
+    };
+    let reciprocal = RECIPROCALS[views as usize];
+    sums.map(|sum| ((u64::from(sum + views / 2) * reciprocal) >> 32) as u8)
 }
 
 /// Bits of a float in the order of its value; never 0 for a finite one.
@@ -202,6 +236,7 @@ fn from_ordered(bits: u32) -> f32 {
 
 impl View<'_> {
     fn check(&self) -> Result<(), FusionError> {
+        self.camera.check()?;
         let Intrinsics { width, height, .. } = self.camera.intrinsics;
         let pixels = width * height;
         for (what, actual, expected) in [
@@ -399,6 +434,85 @@ mod tests {
         for value in values {
             assert_eq!(from_ordered(ordered(value)).to_bits(), value.to_bits());
             assert_ne!(ordered(value), 0);
+        }
+    }
+
+    #[test]
+    fn the_mean_is_the_rounded_quotient() {
+        for views in 1..=MAX_VIEWS as u32 {
+            for sum in 0..=255 * views {
+                let expected = ((sum + views / 2) / views) as u8;
+                assert_eq!(mean([sum; 3], views), [expected; 3], "{sum} / {views}");
+            }
+        }
+    }
+
+    #[test]
+    fn whole_numbers_and_fractions_round_down() {
+        for x in [0u32, 1, 2, 159, 160, 51_199, (1 << 22) - 1] {
+            assert_eq!(whole(floor(x as f32)), x);
+        }
+        for x in [
+            0.25f32,
+            0.5,
+            0.75,
+            0.999_999_94,
+            1.5,
+            2.5,
+            159.999_98,
+            319.5,
+        ] {
+            assert_eq!(floor(x), x.floor(), "{x}");
+        }
+    }
+
+    #[test]
+    fn a_camera_or_a_workspace_without_sense_is_refused() {
+        let mut camera = above(0.5, 0.0);
+        camera.intrinsics.fx_px = 0.0;
+        let (rgb, depth_m) = images(1.0, [1, 2, 3]);
+        let mut out = Heightmap::new(Workspace::RAVENS);
+        let view = View {
+            camera: &camera,
+            rgb: &rgb,
+            depth_m: &depth_m,
+        };
+        let refusal = Fusion::default().fuse(&[view], &mut out).unwrap_err();
+        assert!(matches!(refusal, FusionError::Camera(_)), "{refusal}");
+        out.workspace.pixel_size_m = f64::NAN;
+        let refusal = Fusion::default().fuse(&[], &mut out).unwrap_err();
+        assert!(matches!(refusal, FusionError::Workspace(_)), "{refusal}");
+    }
+
+    #[test]
+    fn one_fusion_serves_cameras_and_workspaces_of_any_size_in_turn() {
+        let small = above(0.5, 0.0);
+        let (rgb, depth_m) = images(1.0, [1, 2, 3]);
+        let view = View {
+            camera: &small,
+            rgb: &rgb,
+            depth_m: &depth_m,
+        };
+        let coarse = Workspace {
+            rows: 10,
+            cols: 5,
+            pixel_size_m: 0.1,
+            ..Workspace::RAVENS
+        };
+        let mut used = Fusion::default();
+        for (workspace, views) in [
+            (Workspace::RAVENS, vec![view; 3]),
+            (coarse, vec![view]),
+            (Workspace::RAVENS, vec![]),
+            (Workspace::RAVENS, vec![view; 2]),
+        ] {
+            let (mut out, mut expected) = (Heightmap::new(workspace), Heightmap::new(workspace));
+            // Whatever was there before is gone.
+            out.height_m.fill(9.0);
+            let report = used.fuse(&views, &mut out).unwrap();
+            assert_eq!(Fusion::default().fuse(&views, &mut expected), Ok(report));
+            assert_eq!(out, expected);
+            assert_eq!(report.coverage == 0.0, views.is_empty());
         }
     }
 

@@ -11,4 +11,4 @@ mod workspace;
 
 pub use camera::{Camera, CameraError, Intrinsics};
 pub use fusion::{Fusion, FusionError, FusionReport, View};
-pub use workspace::{Heightmap, HeightmapError, Pixel, Workspace};
+pub use workspace::{Heightmap, HeightmapError, Pixel, Workspace, WorkspaceError};

@@ -167,8 +167,8 @@ fn color_of(share: f32) -> Rgb<u8> {
         [94.0, 201.0, 98.0],
         [253.0, 231.0, 37.0],
     ];
-    // NaN becomes 0.
-    let place = share.max(0.0).min(1.0) * 4.0;
+    // NaN becomes black.
+    let place = share.clamp(0.0, 1.0) * 4.0;
     let below = (place as usize).min(3);
     let part = place - below as f32;
     Rgb([0, 1, 2].map(|channel| {

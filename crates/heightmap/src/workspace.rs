@@ -20,6 +20,19 @@ pub struct Workspace {
     pub z_max_m: f64,
 }
 
+/// Far beyond any table; every cell's index is a whole `f32`.
+const MAX_CELLS: usize = 1 << 22;
+
+/// A workspace that covers nothing.
+#[derive(Clone, Debug, thiserror::Error, PartialEq)]
+#[error("the workspace {workspace:?} cannot be used, expected {expected}")]
+pub struct WorkspaceError {
+    /// The workspace.
+    workspace: Workspace,
+    /// What was expected.
+    expected: &'static str,
+}
+
 /// A cell of a heightmap.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, PartialOrd, Ord, Serialize, Deserialize)]
 pub struct Pixel {
@@ -40,7 +53,33 @@ impl Workspace {
         z_max_m: 0.28,
     };
 
+    /// Checks that the grid has cells, not too many of them, and that all measures make sense.
+    pub fn check(&self) -> Result<(), WorkspaceError> {
+        let cells = self.rows.checked_mul(self.cols);
+        let positive = self.pixel_size_m.is_finite() && self.pixel_size_m > 0.0;
+        let origin = self.origin_m.iter().all(|part| part.is_finite());
+        let range = self.z_min_m.is_finite() && self.z_max_m.is_finite();
+        let checks = [
+            (
+                cells.is_some_and(|cells| (1..=MAX_CELLS).contains(&cells)),
+                "rows * cols between 1 and 4194304",
+            ),
+            (positive, "a positive pixel_size_m"),
+            (origin, "a finite origin_m"),
+            (range, "finite z_min_m and z_max_m"),
+            (self.z_min_m < self.z_max_m, "z_min_m below z_max_m"),
+        ];
+        match checks.into_iter().find(|(good, _)| !good) {
+            Some((_, expected)) => Err(WorkspaceError {
+                workspace: *self,
+                expected,
+            }),
+            None => Ok(()),
+        }
+    }
+
     /// Number of cells.
+    #[allow(clippy::len_without_is_empty, reason = "a grid without cells is none")]
     pub const fn len(&self) -> usize {
         self.rows * self.cols
     }
@@ -116,13 +155,108 @@ impl Heightmap {
         self.height_m[pixel.row * self.workspace.cols + pixel.col]
     }
 
-    /// Share of cells whose height differs by more than `tolerance_m`: how much the scene changed.
+    /// Share of cells whose height differs by more than `tolerance_m`: how much the scene changed. All
+    /// of it if the heightmaps cover different workspaces.
     pub fn changed_fraction(&self, other: &Self, tolerance_m: f32) -> f64 {
-        let changed = self
-            .height_m
-            .iter()
-            .zip(&other.height_m)
-            .filter(|(a, b)| (*a - *b).abs() > tolerance_m);
-        changed.count() as f64 / self.workspace.len() as f64
+        if self.workspace != other.workspace || self.height_m.len() != other.height_m.len() {
+            return 1.0;
+        }
+        let same = |(a, b): &(&f32, &f32)| (*a - *b).abs() <= tolerance_m;
+        let pairs = self.height_m.iter().zip(&other.height_m);
+        let changed = pairs.filter(|pair| !same(pair)).count();
+        changed as f64 / self.workspace.len() as f64
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+
+    #[test]
+    fn rows_run_along_y_and_columns_along_x() {
+        let workspace = Workspace::RAVENS;
+        let pixel = |x_m, y_m| workspace.pixel(&Point2::new(x_m, y_m));
+        assert_eq!(pixel(0.25, -0.5), Some(Pixel { row: 0, col: 0 }));
+        assert_eq!(pixel(0.4999, -0.4999), Some(Pixel { row: 0, col: 79 }));
+        assert_eq!(pixel(0.2501, 0.4999), Some(Pixel { row: 319, col: 0 }));
+        for (x_m, y_m) in [(0.75, 0.0), (0.5, 0.5), (0.2499, 0.0), (0.5, -0.5001)] {
+            assert_eq!(pixel(x_m, y_m), None, "{x_m}, {y_m}");
+        }
+        assert_eq!(pixel(f64::NAN, 0.0), None);
+        assert_eq!(pixel(0.5, f64::INFINITY), None);
+        let center = workspace.center(Pixel { row: 0, col: 159 });
+        assert!((center - Point2::new(0.7484375, -0.4984375)).amax() < 1e-12);
+    }
+
+    #[test]
+    fn yaw_turns_columns_towards_rows() {
+        let workspace = Workspace::RAVENS;
+        let pose = workspace.pose(Pixel { row: 100, col: 50 }, std::f64::consts::FRAC_PI_2);
+        let ahead = pose * Point2::new(workspace.pixel_size_m, 0.0);
+        assert_eq!(workspace.pixel(&ahead), Some(Pixel { row: 101, col: 50 }));
+    }
+
+    #[test]
+    fn a_workspace_without_sense_is_refused() {
+        let good = Workspace::RAVENS;
+        assert_eq!(good.check(), Ok(()));
+        let bad = [
+            Workspace { rows: 0, ..good },
+            Workspace {
+                rows: usize::MAX,
+                ..good
+            },
+            Workspace {
+                pixel_size_m: 0.0,
+                ..good
+            },
+            Workspace {
+                pixel_size_m: f64::NAN,
+                ..good
+            },
+            Workspace {
+                origin_m: Point2::new(f64::NAN, 0.0),
+                ..good
+            },
+            Workspace {
+                z_max_m: f64::INFINITY,
+                ..good
+            },
+            Workspace {
+                z_min_m: 0.3,
+                ..good
+            },
+        ];
+        for workspace in bad {
+            assert!(workspace.check().is_err(), "{workspace:?}");
+        }
+    }
+
+    #[test]
+    fn changes_are_counted_cell_by_cell() {
+        let before = Heightmap::new(Workspace::RAVENS);
+        let mut after = before.clone();
+        after.height_m[..512].fill(0.01);
+        assert_eq!(before.changed_fraction(&after, 0.005), 0.01);
+        assert_eq!(before.changed_fraction(&after, 0.02), 0.0);
+        after.height_m[0] = f32::NAN;
+        assert_eq!(before.changed_fraction(&after, 0.02), 1.0 / 51200.0);
+        let elsewhere = Workspace {
+            z_max_m: 0.5,
+            ..Workspace::RAVENS
+        };
+        assert_eq!(
+            before.changed_fraction(&Heightmap::new(elsewhere), 0.005),
+            1.0
+        );
+    }
+
+    proptest! {
+        #[test]
+        fn a_cell_holds_its_centre(row in 0usize..320, col in 0usize..160) {
+            let pixel = Pixel { row, col };
+            prop_assert_eq!(Workspace::RAVENS.pixel(&Workspace::RAVENS.center(pixel)), Some(pixel));
+        }
     }
 }

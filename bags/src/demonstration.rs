@@ -82,11 +82,11 @@ pub enum DemonstrationError {
     },
 }
 
-const HEIGHTMAP: &str = "heightmap";
-const GOAL: &str = "goal";
-const PICK_PLACE: &str = "pick_place";
-const STEP_RESULT: &str = "step_result";
-const REWARD: &str = "reward";
+const HEIGHTMAP: &str = "/heightmap";
+const GOAL: &str = "/goal";
+const PICK_PLACE: &str = "/pick_place";
+const STEP_RESULT: &str = "/step_result";
+const REWARD: &str = "/reward";
 const FRAME: &str = "world";
 
 /// Demonstrations have no clock: the observation before step `index` is `index` seconds old.
@@ -120,8 +120,17 @@ impl Demonstration {
 
     /// Writes the bag. What an earlier try has left half-written is replaced, a whole bag is not.
     pub fn write(&self, path: &Path) -> Result<(), DemonstrationError> {
+        self.write_with(path, Compression::default())
+    }
+
+    /// [`Self::write`] with another compression.
+    pub fn write_with(
+        &self,
+        path: &Path,
+        compression: Compression,
+    ) -> Result<(), DemonstrationError> {
         BagWriter::discard_partial(path)?;
-        let mut bag = BagWriter::create(path, Compression::default())?;
+        let mut bag = BagWriter::create(path, compression)?;
         bag.note("problem", &self.problem);
         bag.note("seed", self.seed);
         let heightmaps = bag.add::<sctn_msgs::Heightmap>(HEIGHTMAP, Qos::LATCHED)?;

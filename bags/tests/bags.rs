@@ -1,7 +1,7 @@
 //! Bags: what is written is read, and what is no bag says why.
 
-use bags::{BagError, BagReader, BagWriter, Compression, Qos, partial_path};
-use msgs::{description, rosgraph_msgs, std_msgs};
+use bags::{BagError, BagReader, BagWriter, Compression, Qos, RawMessage, partial_path};
+use msgs::{description, rosgraph_msgs, sensor_msgs, std_msgs};
 use proptest::prelude::*;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
@@ -122,6 +122,30 @@ fn a_topic_and_a_span_of_time_are_found_without_the_rest() {
     assert_eq!(found(&["/chatter"]), (2345..2355).collect::<Vec<_>>());
     assert_eq!(found(&["/clock"]), [2350]);
     assert_eq!(found(&[]).len(), 11);
+}
+
+#[test]
+fn bags_of_another_program_are_read() {
+    for name in ["rosbags_plain", "rosbags_zstd"] {
+        let bag = Path::new(env!("CARGO_MANIFEST_DIR"))
+            .join("tests/data")
+            .join(name);
+        let reader = BagReader::open(&bag).unwrap();
+        let messages: Vec<RawMessage> = reader.messages().map(Result::unwrap).collect();
+        for (index, message) in messages[..5].iter().enumerate() {
+            assert_eq!(
+                message.decode::<std_msgs::String>().unwrap(),
+                text(format!("text {index}"))
+            );
+            assert_eq!(message.log_time, Duration::new(1, index as u32));
+        }
+        let image: sensor_msgs::Image = messages[5].decode().unwrap();
+        assert_eq!(
+            (image.height, image.width, image.data.as_slice()),
+            (2, 3, [0, 1, 2, 3, 4, 5].as_slice())
+        );
+        assert_eq!(messages.len(), 6);
+    }
 }
 
 #[test]

@@ -119,7 +119,7 @@ fn the_bag_shows_the_next_goal_of_each_step() {
     demonstration.write(&path).unwrap();
     let bag = bags::BagReader::open(&path).unwrap();
     let goals: Vec<sctn_msgs::Goal> = bag
-        .messages_between(&["goal"], Duration::ZERO, Duration::MAX)
+        .messages_between(&["/goal"], Duration::ZERO, Duration::MAX)
         .map(|message| message.unwrap().decode().unwrap())
         .collect();
     // The last step leads to no reward and has no goal.
@@ -179,31 +179,31 @@ fn a_bag_without_a_demonstration_says_what_is_missing() {
     };
     let empty = refusal("empty", &notes);
     assert!(
-        empty.ends_with("step 1: the end, expected heightmap"),
+        empty.ends_with("step 1: the end, expected /heightmap"),
         "{empty}"
     );
     let actions = refusal("actions", &|bag| {
         notes(bag);
         let topic = bag
-            .add::<sctn_msgs::PickPlace>("pick_place", Qos::RELIABLE)
+            .add::<sctn_msgs::PickPlace>("/pick_place", Qos::RELIABLE)
             .unwrap();
         bag.write(topic, Duration::ZERO, &sctn_msgs::PickPlace::default())
             .unwrap();
     });
     assert!(
-        actions.ends_with("step 1: a message on pick_place, expected heightmap"),
+        actions.ends_with("step 1: a message on /pick_place, expected /heightmap"),
         "{actions}"
     );
     let hostile = refusal("hostile", &|bag| {
         notes(bag);
         let topic = bag
-            .add::<sctn_msgs::Heightmap>("heightmap", Qos::LATCHED)
+            .add::<sctn_msgs::Heightmap>("/heightmap", Qos::LATCHED)
             .unwrap();
         bag.write(topic, Duration::ZERO, &sctn_msgs::Heightmap::default())
             .unwrap();
     });
     assert!(
-        hostile.ends_with("topic heightmap, step 1: rows is 0, expected at least 1"),
+        hostile.ends_with("topic /heightmap, step 1: rows is 0, expected at least 1"),
         "{hostile}"
     );
 }

@@ -14,6 +14,8 @@ const HOME_TOLERANCE_RAD: f64 = 1e-3;
 const START_TOLERANCE_RAD: f64 = 1e-2;
 /// The lag rule: a tip further behind stops the arm (an over-pulled cable).
 pub const MAX_LAG_M: f64 = 0.02;
+/// A tip that has just been let go of has this long to spring back before the lag rule holds.
+const SPRING_BACK_STEPS: u64 = world::STEPS_PER_SECOND as u64 / 10;
 /// A motion is over when the tip has caught up this far, ...
 const CAUGHT_UP_M: f64 = 1e-3;
 /// ... or when it has had this long to do so.
@@ -255,9 +257,7 @@ impl Cell {
         if let Phase::Moving = motion.phase {
             self.joints = motion.trajectory.sample(elapsed);
         }
-        let lag_before_m = self.world.lag_m();
         self.step()?;
-        // A tip that was let go of catches up: that is no reason to stop.
         let lag_m = self.world.lag_m();
         let ended = match &mut motion.phase {
             Phase::Settling(rest) => {
@@ -266,7 +266,7 @@ impl Cell {
                 over.then_some(MotionEnd::Reached)
             }
             _ if motion.until_contact && self.world.touches() => Some(MotionEnd::Contact),
-            _ if lag_m > MAX_LAG_M && lag_m >= lag_before_m => Some(MotionEnd::Lag),
+            _ if lag_m > MAX_LAG_M && motion.steps > SPRING_BACK_STEPS => Some(MotionEnd::Lag),
             Phase::Moving => {
                 if elapsed >= motion.trajectory.duration() {
                     motion.phase = Phase::CatchingUp(0);

@@ -370,3 +370,161 @@ impl Task for RoutingTask {
         })
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use proptest::prelude::*;
+    use rand::SeedableRng;
+
+    fn away() -> Isometry3<f64> {
+        Isometry3::translation(0.0, 0.0, 0.5)
+    }
+
+    fn scene(seed: u64, pegs: usize) -> (World, RoutingTask) {
+        let mut world = World::new(&away());
+        let routing = Routing {
+            parameters: Parameters {
+                pegs: (pegs, pegs),
+                ..Parameters::default()
+            },
+        };
+        let anchor = Isometry2::new(Vector2::new(0.5, -0.3), 0.2);
+        let mut rng = ChaCha8Rng::seed_from_u64(seed);
+        let task = routing.draw(&mut world, &anchor, &mut rng);
+        (world, task)
+    }
+
+    /// Lays the cable along a polyline from its anchor; what is left over goes straight on.
+    fn lie(world: &mut World, task: &RoutingTask, via: &[Point2<f64>], z: f64) {
+        let mut at = Point2::new(ANCHOR_X_M, 0.0);
+        let mut direction = Vector2::x();
+        let mut via = via.iter().copied().peekable();
+        for bead in &task.cable.beads[1..] {
+            let mut left = BeadChain::PITCH_M;
+            while let Some(next) = via.peek() {
+                let way = next - at;
+                if way.norm() > 0.0 {
+                    direction = way.normalize();
+                }
+                if way.norm() > left {
+                    break;
+                }
+                left -= way.norm();
+                at = *next;
+                via.next();
+            }
+            at += direction * left;
+            let p = task.anchor * at;
+            world.place(*bead, &Isometry3::translation(p.x, p.y, z));
+        }
+    }
+
+    /// Past the pegs on the given sides, then to the end's goal.
+    fn past(task: &RoutingTask, sides: &[f64]) -> Vec<Point2<f64>> {
+        let passes = task.pegs.iter().zip(sides).map(|(peg, side)| {
+            let off = Vector2::new(0.0, peg.side * side * (PASS_M + 2e-3));
+            peg.center + off
+        });
+        passes.chain([task.end]).collect()
+    }
+
+    const ON_TABLE_Z_M: f64 = BeadChain::BEAD_RADIUS_M;
+
+    #[test]
+    fn a_cable_past_all_pegs_and_stretched_earns_everything() {
+        for pegs in [2, 3] {
+            for seed in 0..20 {
+                let (mut world, mut task) = scene(seed, pegs);
+                assert_eq!(task.goal_count(), pegs + 1);
+                assert_eq!(task.max_steps(), pegs + 4);
+                let path = past(&task, &[1.0; 3]);
+                lie(&mut world, &task, &path, ON_TABLE_Z_M);
+                assert_eq!(task.reached(&world), pegs + 1, "seed {seed}");
+            }
+        }
+    }
+
+    #[test]
+    fn a_skipped_peg_ends_the_count() {
+        let (mut world, mut task) = scene(1, 3);
+        for (sides, expected) in [
+            ([-1.0, 1.0, 1.0], 0),
+            ([1.0, -1.0, 1.0], 1),
+            ([1.0, 1.0, -1.0], 2),
+        ] {
+            let path = past(&task, &sides);
+            lie(&mut world, &task, &path, ON_TABLE_Z_M);
+            assert_eq!(task.reached(&world), expected, "{sides:?}");
+        }
+    }
+
+    #[test]
+    fn a_cable_drawn_straight_to_the_goal_earns_nothing() {
+        let (mut world, mut task) = scene(1, 3);
+        // Round all pegs on the side where it started, the end where it should be.
+        let below = Point2::new(0.0, START_Y_M);
+        let path = [below, task.end];
+        lie(&mut world, &task, &path, ON_TABLE_Z_M);
+        assert_eq!(task.reached(&world), 0);
+    }
+
+    #[test]
+    fn a_cable_on_top_of_the_pegs_earns_nothing() {
+        let (mut world, mut task) = scene(1, 3);
+        let path = past(&task, &[1.0; 3]);
+        lie(&mut world, &task, &path, PEG_HEIGHT_M + ON_TABLE_Z_M);
+        assert_eq!(task.reached(&world), 0);
+    }
+
+    #[test]
+    fn a_cable_far_from_its_pegs_earns_nothing() {
+        let (mut world, mut task) = scene(1, 2);
+        let far = task
+            .pegs
+            .iter()
+            .map(|peg| peg.pass() + Vector2::new(0.0, 0.03 * peg.side));
+        let path: Vec<_> = far.collect();
+        lie(&mut world, &task, &path, ON_TABLE_Z_M);
+        assert_eq!(task.reached(&world), 0);
+    }
+
+    #[test]
+    fn a_loop_round_a_peg_is_no_route() {
+        let (mut world, mut task) = scene(1, 3);
+        let center = task.pegs[0].center;
+        let round = (0..=12).map(|i| {
+            let angle = PI - 3.0 * PI * f64::from(i) / 12.0;
+            center + Vector2::new(angle.cos(), angle.sin()) * (PASS_M + 4e-3)
+        });
+        let path: Vec<_> = round.collect();
+        lie(&mut world, &task, &path, ON_TABLE_Z_M);
+        assert_eq!(task.reached(&world), 0);
+    }
+
+    proptest! {
+        #![proptest_config(ProptestConfig::with_cases(64))]
+        #[test]
+        fn a_scene_fits_its_footprint_comes_to_rest_and_earns_nothing(
+            seed in 0u64..1_000_000,
+            pegs in 2usize..=3,
+        ) {
+            let (mut world, mut task) = scene(seed, pegs);
+            for _ in 0..480 {
+                world.step(&away());
+            }
+            prop_assert!(world.fastest_m_s() < 5e-3);
+            prop_assert!(world.joint_error_m(&task.cable) < 1e-3);
+            prop_assert_eq!(task.reached(&world), 0);
+            for body in world.bodies() {
+                let p = task.anchor.inverse_transform_point(&world.position(body).xy());
+                prop_assert!(p.x.abs() < FOOTPRINT_M.0 / 2.0 && p.y.abs() < FOOTPRINT_M.1 / 2.0);
+            }
+            let end = task.end;
+            prop_assert!(end.x.abs() < FOOTPRINT_M.0 / 2.0 && end.y.abs() < FOOTPRINT_M.1 / 2.0);
+            for pose in task.goal_poses() {
+                prop_assert!(pose.translation.vector.iter().all(|v| v.is_finite()));
+            }
+        }
+    }
+}

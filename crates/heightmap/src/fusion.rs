@@ -1,7 +1,8 @@
 //! Fusion of RGB-D views into a heightmap.
 
 use crate::{Camera, CameraError, Heightmap, Intrinsics, Workspace, WorkspaceError};
-use nalgebra::Vector3;
+use nalgebra::{Point2, Point3, Vector2, Vector3};
+use std::ops::Range;
 
 /// More views would overflow the sums of colours.
 const MAX_VIEWS: usize = 128;
@@ -102,11 +103,11 @@ impl Fusion {
         for (index, view) in views.iter().enumerate() {
             self.project(index, view, workspace);
         }
-        let mut seen = 0;
+        let (view_count, mut seen) = (views.len(), 0);
         for (cell, (pixel, height_m)) in rgb.chunks_exact_mut(3).zip(height_m).enumerate() {
             let (mut highest, mut sums, mut views) = (0, [0; 3], 0);
-            for index in (cell..self.highest.len()).step_by(len) {
-                let key = self.highest[index];
+            for view in 0..view_count {
+                let key = self.highest[view * len + cell];
                 highest = key.max(highest);
                 let [_, red, green, blue] = (key as u32).to_be_bytes().map(u32::from);
                 sums = [sums[0] + red, sums[1] + green, sums[2] + blue];
@@ -122,7 +123,7 @@ impl Fusion {
             *height_m = from_ordered((highest >> 32) as u32);
         }
         Ok(FusionReport {
-            views: views.len(),
+            views: view_count,
             coverage: seen as f64 / len as f64,
         })
     }
@@ -154,13 +155,17 @@ impl Fusion {
             to_cells(pose.rotation * Vector3::new(1.0 / fx_px, 0.0, 0.0)).cast::<f32>();
         let (cols, rows) = (workspace.cols as f32, workspace.rows as f32);
         let (z_min_m, z_max_m) = (workspace.z_min_m as f32, workspace.z_max_m as f32);
+        let outline = Outline::new(view.camera, workspace);
         for v in 0..height {
+            // Most pixels see only what is beside the workspace.
+            let columns = outline.columns(v, width);
             let start = Vector3::new(-cx_px / fx_px, (v as f64 - cy_px) / fy_px, 1.0);
             let start = to_cells(pose.rotation * start).cast::<f32>();
-            let depths = &view.depth_m[v * width..][..width];
+            let pixels = v * width + columns.start..v * width + columns.end;
+            let depths = &view.depth_m[pixels.clone()];
             // Two loops, since this one can be done for several pixels at once and the next cannot.
             let row = self.cells.iter_mut().zip(&mut self.heights);
-            for (((cell, ordered_z), &depth_m), &u) in row.zip(depths).zip(&self.columns) {
+            for (((cell, ordered_z), &depth_m), &u) in row.zip(depths).zip(&self.columns[columns]) {
                 let x = depth_m * (u * per_column.x + start.x) + origin.x;
                 let y = depth_m * (u * per_column.y + start.y) + origin.y;
                 let z_m = depth_m * (u * per_column.z + start.z) + origin.z;
@@ -176,7 +181,7 @@ impl Fusion {
                 *cell = if inside { index } else { OUTSIDE };
                 *ordered_z = ordered(z_m);
             }
-            let colors = view.rgb[3 * v * width..][..3 * width].chunks_exact(3);
+            let colors = view.rgb[3 * pixels.start..3 * pixels.end].chunks_exact(3);
             for ((&cell, &z), color) in self.cells.iter().zip(&self.heights).zip(colors) {
                 if let Some(highest) = highest.get_mut(cell as usize) {
                     let color = u32::from_be_bytes([0, color[0], color[1], color[2]]);
@@ -184,6 +189,70 @@ impl Fusion {
                 }
             }
         }
+    }
+}
+
+/// The outline of a workspace on an image.
+struct Outline {
+    /// The edges of the box, each from its upper to its lower end; none if a corner is not before the
+    /// camera.
+    edges: Option<[(Point2<f64>, Point2<f64>); 12]>,
+}
+
+impl Outline {
+    /// Far more than the rounding of a point.
+    const MARGIN_M: f64 = 1e-3;
+
+    fn new(camera: &Camera, workspace: &Workspace) -> Self {
+        let margin = Vector3::repeat(Self::MARGIN_M);
+        let size =
+            workspace.pixel_size_m * Vector2::new(workspace.cols as f64, workspace.rows as f64);
+        let low = workspace.origin_m.coords.push(workspace.z_min_m) - margin;
+        let high = (workspace.origin_m.coords + size).push(workspace.z_max_m) + margin;
+        let corner = |index: usize| {
+            let side = |axis: usize| if index >> axis & 1 == 0 { low } else { high }[axis];
+            let (image, depth_m) = camera.project(&Point3::new(side(0), side(1), side(2)))?;
+            (depth_m > Self::MARGIN_M).then_some(image)
+        };
+        let edge = |number: usize| {
+            let (axis, others) = (number / 4, number % 4);
+            // The two bits of `others` with a 0 between them where the axis is.
+            let start = (others >> axis << (axis + 1)) | (others & ((1 << axis) - 1));
+            let (a, b) = (corner(start)?, corner(start | 1 << axis)?);
+            Some(if a.y <= b.y { (a, b) } else { (b, a) })
+        };
+        let mut edges = [Default::default(); 12];
+        for (number, place) in edges.iter_mut().enumerate() {
+            match edge(number) {
+                Some(edge) => *place = edge,
+                None => return Self { edges: None },
+            }
+        }
+        Self { edges: Some(edges) }
+    }
+
+    /// The pixels of an image row that can see the workspace.
+    fn columns(&self, row: usize, width: usize) -> Range<usize> {
+        let Some(edges) = &self.edges else {
+            return 0..width;
+        };
+        let (v, mut first, mut last) = (row as f64, f64::INFINITY, f64::NEG_INFINITY);
+        for (upper, lower) in edges
+            .iter()
+            .filter(|(upper, lower)| upper.y <= v && v <= lower.y)
+        {
+            let share = if lower.y > upper.y {
+                (v - upper.y) / (lower.y - upper.y)
+            } else {
+                0.0
+            };
+            let u = upper.x + share * (lower.x - upper.x);
+            // A level edge is met by those that it joins.
+            (first, last) = (first.min(u), last.max(u));
+        }
+        // Casts clamp: what is left of the image becomes 0.
+        let end = ((last.floor() + 1.0) as usize).min(width);
+        (first.ceil() as usize).min(end)..end
     }
 }
 
@@ -261,7 +330,7 @@ impl View<'_> {
 mod tests {
     use super::*;
     use crate::Pixel;
-    use nalgebra::{Isometry3, Point2, Point3, Translation3, UnitQuaternion};
+    use nalgebra::{Isometry3, Translation3, UnitQuaternion};
     use proptest::prelude::*;
 
     const SMALL: Intrinsics = Intrinsics {
@@ -540,6 +609,25 @@ mod tests {
             prop_assert!(agree >= out.height_m.len() - 4, "{agree}");
             let agree = out.rgb.iter().zip(&expected.rgb).filter(|(a, b)| a == b).count();
             prop_assert!(agree >= out.rgb.len() - 12, "{agree}");
+        }
+
+        #[test]
+        fn cameras_anywhere_see_what_the_definition_says(
+            depths in prop::collection::vec(0.05f32..2.0, 1200),
+            position in prop::array::uniform3(-0.6..1.1),
+            rotation in prop::array::uniform3(-3.0..3.0),
+        ) {
+            let camera = Camera {
+                world_from_camera: Isometry3::new(position.into(), rotation.into()),
+                ..above(0.0, 0.0)
+            };
+            let rgb = [1, 2, 3].repeat(1200);
+            let view = View { camera: &camera, rgb: &rgb, depth_m: &depths };
+            let mut out = Heightmap::new(Workspace::RAVENS);
+            Fusion::default().fuse(&[view], &mut out).unwrap();
+            let expected = reference(&[view], Workspace::RAVENS);
+            let differ = out.height_m.iter().zip(&expected.height_m).filter(|(a, b)| (*a - *b).abs() > 2e-6);
+            prop_assert!(differ.count() <= 2);
         }
 
         #[test]

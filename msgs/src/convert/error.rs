@@ -39,7 +39,13 @@ pub enum ConvertError {
     },
     /// Points that make no trajectory.
     #[error("trajectory points: {0}")]
-    Trajectory(#[from] ur5::PlanError),
+    Trajectory(Box<ur5::PlanError>),
+}
+
+impl From<ur5::PlanError> for ConvertError {
+    fn from(error: ur5::PlanError) -> Self {
+        Self::Trajectory(Box::new(error))
+    }
 }
 
 pub(super) fn unexpected(

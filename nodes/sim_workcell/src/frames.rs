@@ -111,7 +111,7 @@ mod tests {
         convert::color_from_msg(&frame.color, &intrinsics, &mut rgb).unwrap();
         convert::depth_from_msg(&frame.depth, &intrinsics, &mut depth_m).unwrap();
         assert_eq!((rgb, depth_m), (image.rgb, image.depth_m));
-        let tf = camera_transforms(&[camera.clone()], "world", Duration::ZERO).unwrap();
+        let tf = camera_transforms(std::slice::from_ref(&camera), "world", Duration::ZERO).unwrap();
         assert_eq!(tf.transforms[0].child_frame_id, frame.color.header.frame_id);
         let pose = convert::isometry_from_msg(&tf.transforms[0].transform).unwrap();
         assert_eq!(pose, camera.world_from_camera);

@@ -134,7 +134,7 @@ impl Active {
         let error = JointTrajectoryPoint {
             positions: vec![0.0; point.positions.len()],
             velocities: vec![0.0; point.velocities.len()],
-            time_from_start: point.time_from_start.clone(),
+            time_from_start: point.time_from_start,
             ..Default::default()
         };
         match self {
@@ -498,7 +498,7 @@ impl Hardware {
     fn say_status(&mut self) -> anyhow::Result<()> {
         let header = self.header()?;
         self.clock.publish(Clock {
-            clock: header.stamp.clone(),
+            clock: header.stamp,
         });
         self.joint_states.publish(convert::joint_state_to_msg(
             header,

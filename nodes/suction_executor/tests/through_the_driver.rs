@@ -484,6 +484,7 @@ async fn without_require_approval_a_proposal_moves_once_by_itself_until_a_stop()
     let automatic = vec![("require_approval", "false".to_owned())];
     let (mut bench, mut environment, _) = proposed(&[], &automatic).await;
     let action = reference().demonstrate().unwrap();
+    let (time, settings) = (environment.cell().time(), environment.settings().unwrap());
     let expected = environment.step(&action).unwrap();
     let result = bench.result().await;
     assert_eq!(
@@ -498,7 +499,7 @@ async fn without_require_approval_a_proposal_moves_once_by_itself_until_a_stop()
     );
     // The same message once more moves nothing.
     let before = bench.joints().await.position;
-    bench.propose(1, Duration::ZERO, &action, &environment.settings().unwrap());
+    bench.propose(1, time, &action, &settings);
     tokio::time::sleep(Duration::from_secs(1)).await;
     assert_eq!(bench.joints().await.position, before);
     // Nor does anything by itself after a stop.

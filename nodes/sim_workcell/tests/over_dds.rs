@@ -1,0 +1,271 @@
+//! The simulated cell as a client of the UR driver and a viewer of the cameras sees it.
+
+use std::future::Future;
+use std::net::UdpSocket;
+use std::path::Path;
+use std::sync::atomic::{AtomicU16, Ordering};
+use std::time::Duration;
+
+use msgs::control_msgs::{
+    FollowJointTrajectory, FollowJointTrajectoryGoal, FollowJointTrajectoryResult,
+};
+use msgs::convert;
+use msgs::sensor_msgs::{Image, JointState};
+use msgs::ur_dashboard_msgs::{RobotMode, SafetyMode};
+use msgs::ur_msgs::{IOStates, SetIO, SetIORequest};
+use node_kit::{
+    CallError, CallOptions, Context, GoalStatus, Network, Node, Parameters, Qos, RosArguments,
+    Subscription,
+};
+use serde::{Deserialize, Serialize};
+use ur5::{JointTrajectory, Joints, TrajectoryPoint, WorkCell};
+
+const FOLLOW: &str = "scaled_joint_trajectory_controller/follow_joint_trajectory";
+const SET_IO: &str = "io_and_status_controller/set_io";
+const PATIENCE: Duration = Duration::from_secs(60);
+
+#[derive(Default, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+struct NoParameters {}
+impl Parameters for NoParameters {}
+
+/// A domain whose discovery ports nobody on this machine has.
+fn free_domain() -> u16 {
+    static NEXT: AtomicU16 = AtomicU16::new(0);
+    let start = std::process::id() as u16 % 100 + 7 * NEXT.fetch_add(1, Ordering::Relaxed);
+    let free = |port| UdpSocket::bind(("0.0.0.0", port)).is_ok();
+    (0..100)
+        .map(|offset| 1 + (start + offset) % 100)
+        .find(|domain| {
+            let first = 7400 + 250 * domain;
+            (first..first + 2).chain(first + 10..first + 20).all(free)
+        })
+        .expect("a free domain")
+}
+
+async fn within<T>(what: &str, future: impl Future<Output = T>) -> T {
+    tokio::time::timeout(PATIENCE, future)
+        .await
+        .unwrap_or_else(|_| panic!("no {what} within {PATIENCE:?}"))
+}
+
+/// Starts the node on a domain of its own; gives a node beside it.
+fn start(parameters: &[(&str, &str)]) -> (Context, Context, Node) {
+    let network = Network {
+        domain_id: free_domain(),
+        localhost_only: true,
+    };
+    let problems_dir = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../config/problems");
+    let mut line = vec!["--ros-args".to_owned()];
+    line.extend([
+        "-p".into(),
+        format!("problems_dir:={}", problems_dir.display()),
+    ]);
+    for (name, value) in parameters {
+        line.extend(["-p".to_owned(), format!("{name}:={value}")]);
+    }
+    let own = Context::new(network);
+    let (node, _) = own
+        .node::<NoParameters>("viewer", &RosArguments::default())
+        .unwrap();
+    let sim = Context::new(network);
+    let arguments = RosArguments::parse(line).unwrap().0;
+    sim.start("sim_workcell", &arguments, sim_workcell::run)
+        .unwrap();
+    (sim, own, node)
+}
+
+/// Turns the base by an angle within a time, from joint positions.
+fn turn(
+    cell: &WorkCell,
+    from: Joints,
+    angle_rad: f64,
+    time: Duration,
+) -> FollowJointTrajectoryGoal {
+    let mut to = from;
+    to[0] += angle_rad;
+    let point = |time, positions_rad| TrajectoryPoint {
+        time,
+        positions_rad,
+        velocities_rad_s: Joints::zeros(),
+    };
+    let points = vec![point(Duration::ZERO, from), point(time, to)];
+    let trajectory = JointTrajectory::new(points).unwrap();
+    FollowJointTrajectoryGoal {
+        trajectory: convert::joint_trajectory_to_msg(&trajectory, &cell.joint_names).unwrap(),
+        ..Default::default()
+    }
+}
+
+async fn newest(subscription: &mut Subscription<JointState>) -> JointState {
+    while subscription.try_recv().is_some() {}
+    within("joint_states", subscription.recv()).await
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn goals_are_checked_carried_out_one_at_a_time_and_cancelled() {
+    let cell = WorkCell::builtin().unwrap();
+    let (sim, _own, node) = start(&[("real_time_factor", "1.0")]);
+    let client = node.action_client::<FollowJointTrajectory>(FOLLOW).unwrap();
+    let mut joint_states = node
+        .subscription::<JointState>("joint_states", Qos::Event)
+        .unwrap();
+    client.wait_for_server(PATIENCE).await.unwrap();
+    let options = CallOptions::default();
+    let at_home = newest(&mut joint_states).await;
+
+    let mut wrong = turn(&cell, cell.arm.home, 0.1, Duration::from_secs(1));
+    wrong.trajectory.joint_names[2] = "tail".into();
+    let elsewhere = turn(
+        &cell,
+        cell.arm.home.add_scalar(0.1),
+        0.1,
+        Duration::from_secs(1),
+    );
+    let fast = turn(&cell, cell.arm.home, 2.0, Duration::from_millis(10));
+    for (goal, code, expected) in [
+        (wrong, FollowJointTrajectoryResult::INVALID_JOINTS, "tail"),
+        (
+            elsewhere,
+            FollowJointTrajectoryResult::INVALID_GOAL,
+            "the arm is at",
+        ),
+        (fast, FollowJointTrajectoryResult::INVALID_GOAL, "rad/s"),
+    ] {
+        let sent = client.send_goal(&goal, &options).await.unwrap();
+        let (status, result) = within("result", sent.result()).await.unwrap();
+        assert_eq!((status, result.error_code), (GoalStatus::Aborted, code));
+        assert!(
+            result.error_string.contains(expected),
+            "{}",
+            result.error_string
+        );
+    }
+    assert_eq!(newest(&mut joint_states).await, at_home);
+
+    let slow = turn(&cell, cell.arm.home, 0.5, Duration::from_secs(5));
+    let sent = client.send_goal(&slow, &options).await.unwrap();
+    while newest(&mut joint_states).await.position == at_home.position {}
+    let second = client.send_goal(&slow, &options).await;
+    assert!(matches!(second, Err(CallError::Rejected { .. })));
+    sent.cancel(&options).await.unwrap();
+    let (status, _) = within("result", sent.result()).await.unwrap();
+    assert_eq!(status, GoalStatus::Canceled);
+    let stopped = newest(&mut joint_states).await;
+    assert!(stopped.velocity.iter().all(|velocity| *velocity == 0.0));
+    tokio::time::sleep(Duration::from_millis(300)).await;
+    assert_eq!(newest(&mut joint_states).await, stopped);
+
+    // From there it can be sent on.
+    let at = convert::joints_from_msg(&stopped, &cell.joint_names).unwrap();
+    let on = turn(&cell, at, 0.1, Duration::from_millis(500));
+    let sent = client.send_goal(&on, &options).await.unwrap();
+    let (status, result) = within("result", sent.result()).await.unwrap();
+    assert_eq!(
+        (status, result.error_code),
+        (GoalStatus::Succeeded, 0),
+        "{}",
+        result.error_string
+    );
+    let reached =
+        convert::joints_from_msg(&newest(&mut joint_states).await, &cell.joint_names).unwrap();
+    assert!((reached[0] - at[0] - 0.1).abs() < 1e-9);
+    sim.shutdown();
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn who_comes_late_hears_the_status_and_sees_the_frames_and_nothing_while_the_arm_is_out() {
+    let cell = WorkCell::builtin().unwrap();
+    let (sim, _own, node) = start(&[("frames_period_s", "0.1")]);
+    let client = node.action_client::<FollowJointTrajectory>(FOLLOW).unwrap();
+    client.wait_for_server(PATIENCE).await.unwrap();
+    tokio::time::sleep(Duration::from_secs(1)).await;
+
+    let status = |name| format!("io_and_status_controller/{name}");
+    let mut robot_mode = node
+        .subscription::<RobotMode>(&status("robot_mode"), Qos::Latched)
+        .unwrap();
+    let mut safety_mode = node
+        .subscription::<SafetyMode>(&status("safety_mode"), Qos::Latched)
+        .unwrap();
+    let mut io_states = node
+        .subscription::<IOStates>(&status("io_states"), Qos::Event)
+        .unwrap();
+    let mut color = node
+        .subscription::<Image>("left/color/image_raw", Qos::Image)
+        .unwrap();
+    assert_eq!(
+        within("robot_mode", robot_mode.recv()).await.mode,
+        RobotMode::RUNNING
+    );
+    assert_eq!(
+        within("safety_mode", safety_mode.recv()).await.mode,
+        SafetyMode::NORMAL
+    );
+    let first = within("frame", color.recv()).await;
+    let second = within("frame", color.recv()).await;
+    assert!(first == second, "a repeated frame differs");
+    assert_eq!(
+        (first.width, first.height, first.encoding.as_str()),
+        (640, 480, "rgb8")
+    );
+    assert!(first.data.iter().any(|byte| *byte != first.data[0]));
+
+    let set_io = node.service_client::<SetIO>(SET_IO).unwrap();
+    set_io.wait_for_server(PATIENCE).await.unwrap();
+    let mut request = SetIORequest {
+        fun: SetIORequest::FUN_SET_DIGITAL_OUT,
+        pin: 3,
+        state: 1.0,
+    };
+    assert!(
+        set_io
+            .call(&request, &CallOptions::default())
+            .await
+            .unwrap()
+            .success
+    );
+    let is_high = |states: &IOStates| {
+        states
+            .digital_out_states
+            .iter()
+            .any(|pin| pin.pin == 3 && pin.state)
+    };
+    while !is_high(&within("io_states", io_states.recv()).await) {}
+    request.pin = 99;
+    assert!(
+        !set_io
+            .call(&request, &CallOptions::default())
+            .await
+            .unwrap()
+            .success
+    );
+
+    let out = turn(&cell, cell.arm.home, 0.3, Duration::from_secs(1));
+    let sent = client
+        .send_goal(&out, &CallOptions::default())
+        .await
+        .unwrap();
+    assert_eq!(
+        within("result", sent.result()).await.unwrap().0,
+        GoalStatus::Succeeded
+    );
+    tokio::time::sleep(Duration::from_millis(300)).await;
+    while color.try_recv().is_some() {}
+    let none = tokio::time::timeout(Duration::from_millis(500), color.recv()).await;
+    assert!(none.is_err(), "a frame while the arm is out");
+    let mut at = cell.arm.home;
+    at[0] += 0.3;
+    let back = turn(&cell, at, -0.3, Duration::from_secs(1));
+    let sent = client
+        .send_goal(&back, &CallOptions::default())
+        .await
+        .unwrap();
+    assert_eq!(
+        within("result", sent.result()).await.unwrap().0,
+        GoalStatus::Succeeded
+    );
+    let after = within("frame", color.recv()).await;
+    assert!(after.header.stamp.sec > first.header.stamp.sec);
+    sim.shutdown();
+}

@@ -13,6 +13,8 @@ import numpy as np
 import pytest
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import Point, Pose2D
+from rclpy.duration import Duration
+from rclpy.publisher import Publisher
 from sctn_msgs.msg import Heightmap, PickPlace, PrimitiveSettings, StepConfirmation, StepResult
 from std_msgs.msg import Header
 
@@ -41,7 +43,8 @@ class Cell:
     def wait_until_ready(self) -> None:
         """Everybody knows everybody, and the arm has reported where it stands."""
         self.operator.until(
-            lambda: self._heightmaps.get_subscription_count() >= 2 and self._proposals.get_subscription_count() >= 1,
+            # The operator subscribes to both itself.
+            lambda: min(self._heightmaps.get_subscription_count(), self._proposals.get_subscription_count()) >= 2,
             "executor that listens",
             60.0,
         )
@@ -64,7 +67,7 @@ class Cell:
             coverage=1.0,
         )
         change(heightmap)
-        self._heightmaps.publish(heightmap)
+        self._publish(self._heightmaps, heightmap)
         return heightmap
 
     def propose(self, heightmap: Heightmap, change: Callable[[PickPlace], None] = lambda _: None) -> PickPlace:
@@ -84,12 +87,12 @@ class Cell:
             module="placing",
         )
         change(proposal)
-        self._proposals.publish(proposal)
+        self.repeat(proposal)
         return proposal
 
     def repeat(self, proposal: PickPlace) -> None:
         """Publishes a proposal once more."""
-        self._proposals.publish(proposal)
+        self._publish(self._proposals, proposal)
 
     def decide(self, proposal_id: int, decision: int = StepConfirmation.APPROVE) -> StepResult:
         """Says a word and returns the answer to it."""
@@ -111,6 +114,12 @@ class Cell:
         """Joint positions in the order of the message [rad]."""
         self.operator.spin(0.1)
         return np.array(self.operator.newest("joint_states").position)
+
+    @staticmethod
+    def _publish(publisher: Publisher, message: Heightmap | PickPlace) -> None:
+        """Returns when the executor has it: a lost packet is sent again."""
+        publisher.publish(message)
+        assert publisher.wait_for_all_acked(Duration(seconds=20)), f"{publisher.topic_name} was not acknowledged"
 
     def _now(self) -> Time:
         return self.operator.newest("clock").clock if self.operator.count("clock") else Time(sec=1)
@@ -223,9 +232,13 @@ def test_a_proposal_from_a_heightmap_that_nobody_saw_moves_nothing(cell: Cell) -
 def test_a_good_proposal_does_move_and_a_duplicate_approval_moves_nothing(cell: Cell) -> None:
     """Also the proof that the tests above could have failed."""
     proposal = cell.propose(cell.observe())
+    home = cell.joints()
+    first = cell.operator.count("joint_states")
     moved = cell.decide(proposal.id)
     assert moved.outcome not in (StepResult.REFUSED, StepResult.REJECTED, StepResult.FAULT), moved.reason
     assert moved.duration.sec > 0
+    reported = cell.operator.received["joint_states"][first:]
+    assert max(np.abs(np.array(state.position) - home).max() for state in reported) > 0.2
     refused(cell, cell.decide(proposal.id), "already carried out")
     # The same message once more is no new proposal.
     cell.repeat(proposal)

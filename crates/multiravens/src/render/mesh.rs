@@ -231,3 +231,77 @@ impl Mesh {
         self.faces.iter().map(|face| face.count - 2).sum()
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use std::collections::BTreeMap;
+    use std::f64::consts::PI;
+
+    /// Six times the volume is the sum over the triangles of the faces.
+    fn volume_m3(mesh: &Mesh) -> f64 {
+        let volume = |face: &Face| {
+            let corner = |i: usize| mesh.vertices[mesh.corners[face.first + i] as usize].coords;
+            let triangles =
+                (1..face.count - 1).map(|i| corner(0).dot(&corner(i).cross(&corner(i + 1))));
+            triangles.sum::<f64>()
+        };
+        mesh.faces.iter().map(volume).sum::<f64>() / 6.0
+    }
+
+    /// Each edge is walked once in either direction.
+    fn is_closed(mesh: &Mesh) -> bool {
+        let mut edges = BTreeMap::new();
+        for face in &mesh.faces {
+            let corners = &mesh.corners[face.first..][..face.count];
+            for (i, &from) in corners.iter().enumerate() {
+                *edges
+                    .entry((from, corners[(i + 1) % face.count]))
+                    .or_insert(0) += 1;
+            }
+        }
+        edges
+            .iter()
+            .all(|(&(a, b), &count)| count == 1 && edges.get(&(b, a)) == Some(&1))
+    }
+
+    #[test]
+    fn shapes_are_closed_and_as_large_as_they_should_be() {
+        let (r, h) = (0.03, 0.08);
+        let ball = 4.0 / 3.0 * PI * r * r * r;
+        let rod = PI * r * r * h;
+        let shapes = [
+            (Mesh::cuboid(Vector3::new(0.1, 0.2, 0.3)), 0.006, 8),
+            (Mesh::cylinder(r, h, 200), rod, 400),
+            (Mesh::sphere(r, 200), ball, 2 + 99 * 200),
+            (Mesh::capsule(r, h, 200), ball + rod, 2 + 100 * 200),
+        ];
+        for (mesh, expected_m3, vertices) in shapes {
+            assert!(is_closed(&mesh));
+            let volume_m3 = volume_m3(&mesh);
+            assert!(
+                (volume_m3 / expected_m3 - 1.0).abs() < 1e-3,
+                "{volume_m3}, {expected_m3}"
+            );
+            assert_eq!(mesh.vertices.len(), vertices);
+        }
+    }
+
+    #[test]
+    fn coarse_shapes_are_as_wide_and_as_high_as_fine_ones() {
+        for segments in [3, 4, 5, 6, 7, 8, 12, 13] {
+            for (mesh, half_m) in [
+                (Mesh::sphere(0.1, segments), 0.1),
+                (Mesh::capsule(0.1, 0.2, segments), 0.2),
+                (Mesh::cylinder(0.1, 0.3, segments), 0.15),
+            ] {
+                assert!(is_closed(&mesh), "{segments}");
+                let reach = |part: fn(&Point3<f64>) -> f64| {
+                    mesh.vertices.iter().map(part).fold(0.0, f64::max)
+                };
+                assert!((reach(|v| v.x) - 0.1).abs() < 1e-12, "{segments}");
+                assert!((reach(|v| v.z) - half_m).abs() < 1e-12, "{segments}");
+            }
+        }
+    }
+}

@@ -19,7 +19,9 @@
 mod mesh;
 mod raster;
 mod scene;
+mod workload;
 
 pub use mesh::{Mesh, MeshError};
 pub use raster::{FAR_M, NEAR_M, Rasteriser, RenderError, RgbdImage};
 pub use scene::{Instance, MeshId, Scene};
+pub use workload::crowded_table;

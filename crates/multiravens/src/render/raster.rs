@@ -157,8 +157,11 @@ fn ceil(x: f64) -> i32 {
 
 impl Spans {
     fn resize(&mut self, width: usize, height: usize) {
-        self.left.resize(height, 0);
-        self.right.resize(height, 0);
+        // Cleared, so that no span of a wider image is left.
+        for side in [&mut self.left, &mut self.right] {
+            side.clear();
+            side.resize(height, 0);
+        }
         self.width = width as f64;
         self.height = height as f64;
     }

@@ -5,13 +5,13 @@
 
 use std::time::{Duration, Instant};
 
-use rustdds::DomainParticipant;
+use rustdds::{DomainParticipant, RTPSEntity};
 
 use crate::service::CallError;
 
 const POLL_PERIOD: Duration = Duration::from_millis(20);
 
-/// The ROS graph as one participant has discovered it, its own endpoints included.
+/// The ROS graph as one node has discovered it, without its own endpoints.
 #[derive(Clone)]
 pub struct Graph {
     participant: DomainParticipant,
@@ -90,18 +90,26 @@ impl Graph {
     }
 
     fn readers(&self, dds_topic: &str) -> usize {
+        let own = self.participant.guid().prefix;
         self.participant
             .discovered_readers()
             .iter()
-            .filter(|reader| reader.subscription_topic_data.topic_name() == dds_topic)
+            .filter(|reader| {
+                reader.subscription_topic_data.topic_name() == dds_topic
+                    && reader.reader_proxy.remote_reader_guid.prefix != own
+            })
             .count()
     }
 
     fn writers(&self, dds_topic: &str) -> usize {
+        let own = self.participant.guid().prefix;
         self.participant
             .discovered_writers()
             .iter()
-            .filter(|writer| writer.publication_topic_data.topic_name == dds_topic)
+            .filter(|writer| {
+                writer.publication_topic_data.topic_name == dds_topic
+                    && writer.writer_proxy.remote_writer_guid.prefix != own
+            })
             .count()
     }
 }

@@ -1,1 +1,162 @@
 //! Node that proposes pick and place poses.
+//!
+//! When to propose is decided in [`Proposer`], which knows no ROS node; the network runs on a thread of
+//! its own.
+
+mod parameters;
+mod picture;
+mod proposer;
+
+use std::time::{Duration, Instant};
+
+use anyhow::Context as _;
+use gctn::{Decision, Policy};
+use msgs::{
+    sctn_msgs::{Goal, Heightmap, PickPlace, StepConfirmation, StepResult},
+    sensor_msgs::Image,
+    visualization_msgs::MarkerArray,
+};
+use node_kit::{Level, Node, Publisher, Qos};
+use tokio::sync::mpsc;
+use tracing::{info, warn};
+
+pub use parameters::GctnPolicyParameters;
+pub use picture::{markers, score_image};
+pub use proposer::{ChangeRule, Job, Proposer};
+
+/// What the network says to a job, and how long it took.
+struct Answer {
+    job: Job,
+    decision: Result<Decision, String>,
+    took: Duration,
+}
+
+/// Runs the node.
+pub async fn run(node: Node, parameters: GctnPolicyParameters) -> anyhow::Result<()> {
+    let path = parameters.checkpoint()?.to_owned();
+    // Before the network, which takes its time to load: nobody shall be missed meanwhile.
+    let outputs = Outputs {
+        node: node.clone(),
+        proposals: node.publisher("pick_place", Qos::Event)?,
+        markers: node.publisher("pick_place/markers", Qos::Latched)?,
+        scores: node.publisher("pick_place/scores", Qos::Latched)?,
+    };
+    let mut confirmations =
+        node.subscription::<StepConfirmation>("step_confirmation", Qos::Event)?;
+    let mut results = node.subscription::<StepResult>("step_result", Qos::Event)?;
+    let mut goals = node.subscription::<Goal>("goal", Qos::Latched)?;
+    let mut heightmaps = node.subscription::<Heightmap>("heightmap", Qos::Latched)?;
+
+    let radius_m = parameters.exclusion_radius_m;
+    let threads = parameters.threads;
+    let shown = path.display().to_string();
+    let policy = node
+        .spawn_blocking(move || {
+            gctn::set_threads(threads);
+            Policy::load(&path).map(|policy| policy.with_exclusion_radius_m(radius_m))
+        })
+        .await
+        .context("loading the checkpoint")?
+        .with_context(|| format!("parameter checkpoint: {shown}"))?;
+    info!("checkpoint {shown} loaded");
+
+    // One job at a time: the proposer gives the next when it has the answer.
+    let (jobs, mut answers) = start_network(&node, policy);
+    let mut proposer = Proposer::new(ChangeRule {
+        tolerance_m: parameters.observation_tolerance_m as f32,
+        fraction: parameters.observation_changed_fraction,
+    });
+    loop {
+        let job = tokio::select! {
+            heightmap = heightmaps.recv() => proposer.observed(heightmap).unwrap_or_else(|error| {
+                heightmaps.reject(error);
+                None
+            }),
+            goal = goals.recv() => proposer.wanted(goal).unwrap_or_else(|error| {
+                goals.reject(error);
+                None
+            }),
+            confirmation = confirmations.recv() => {
+                proposer.confirmed(&confirmation);
+                None
+            }
+            result = results.recv() => proposer.result(&result),
+            answer = answers.recv() => {
+                let answer = answer.context("the network's thread has ended")?;
+                let decision = answer.decision.as_ref().map_err(Clone::clone);
+                let (proposal, job) = proposer.decided(decision);
+                if let Some(proposal) = proposal {
+                    outputs.publish(proposal, &answer);
+                }
+                job
+            }
+        };
+        if let Some(job) = job {
+            jobs.send(job)
+                .await
+                .context("the network's thread has ended")?;
+        }
+    }
+}
+
+/// Decides on a thread of its own until the sender is dropped.
+fn start_network(node: &Node, policy: Policy) -> (mpsc::Sender<Job>, mpsc::Receiver<Answer>) {
+    let (jobs, mut waiting) = mpsc::channel::<Job>(1);
+    let (answers, answered) = mpsc::channel(1);
+    node.spawn_blocking(move || {
+        while let Some(job) = waiting.blocking_recv() {
+            let start = Instant::now();
+            let decision = policy
+                .decide(&job.observation, &job.goal, &job.exclude)
+                .map_err(|error| error.to_string());
+            let took = start.elapsed();
+            let answer = Answer {
+                job,
+                decision,
+                took,
+            };
+            if answers.blocking_send(answer).is_err() {
+                return;
+            }
+        }
+    });
+    (jobs, answered)
+}
+
+struct Outputs {
+    node: Node,
+    proposals: Publisher<PickPlace>,
+    markers: Publisher<MarkerArray>,
+    scores: Publisher<Image>,
+}
+
+impl Outputs {
+    fn publish(&self, proposal: Result<PickPlace, String>, answer: &Answer) {
+        let took_s = ("network_s", format!("{:.3}", answer.took.as_secs_f64()));
+        match (proposal, &answer.decision) {
+            (Ok(proposal), Ok(decision)) => {
+                let header = proposal.header.clone();
+                let message = format!(
+                    "proposal {} for step {}, attempt {}",
+                    proposal.id, proposal.step, proposal.attempt
+                );
+                self.proposals.publish(proposal);
+                info!("{message}");
+                self.node
+                    .diagnostics()
+                    .set("policy", Level::Ok, message, [took_s]);
+                let observation = &answer.job.observation;
+                self.markers
+                    .publish(picture::markers(&header, observation, decision));
+                self.scores
+                    .publish(picture::score_image(header, observation, decision));
+            }
+            (Err(reason), _) | (_, Err(reason)) => {
+                warn!("no proposal: {reason}");
+                self.node
+                    .diagnostics()
+                    .set("policy", Level::Error, reason.clone(), [took_s]);
+            }
+        }
+    }
+}

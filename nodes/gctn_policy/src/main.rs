@@ -1,0 +1,7 @@
+//! The gctn_policy node.
+
+use std::process::ExitCode;
+
+fn main() -> ExitCode {
+    node_kit::main("gctn_policy", gctn_policy::run)
+}

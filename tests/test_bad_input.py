@@ -32,7 +32,11 @@ def test_an_unknown_argument_is_refused_by_name(start, node: str) -> None:
     assert "--no-such-flag" in process.errors()
 
 
-@pytest.mark.parametrize("contents", [b"", b"not safetensors", b"\xff" * 64, b"\x08\x00\x00\x00\x00\x00\x00\x00{}      "])
+@pytest.mark.parametrize(
+    "contents",
+    [b"", b"not safetensors", b"\xff" * 64, b"\x08\x00\x00\x00\x00\x00\x00\x00{}      "],
+    ids=["empty", "text", "header_too_long", "no_configuration"],
+)
 def test_a_broken_checkpoint_is_refused_by_name(start, tmp_path: pathlib.Path, contents: bytes) -> None:
     file = tmp_path / "broken.safetensors"
     file.write_bytes(contents)
@@ -42,7 +46,9 @@ def test_a_broken_checkpoint_is_refused_by_name(start, tmp_path: pathlib.Path, c
     assert "panicked" not in process.errors()
 
 
-@pytest.mark.parametrize("contents", [b"", b"not a bag", b"\x89MCAP0\r\n" + b"\xff" * 64])
+@pytest.mark.parametrize(
+    "contents", [b"", b"not a bag", b"\x89MCAP0\r\n" + b"\xff" * 64], ids=["empty", "text", "records_of_nonsense"]
+)
 def test_a_bag_that_is_not_one_is_refused_by_name(start, tmp_path: pathlib.Path, contents: bytes) -> None:
     file = tmp_path / "broken.mcap"
     file.write_bytes(contents)

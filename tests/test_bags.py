@@ -7,7 +7,8 @@ import pathlib
 import numpy as np
 import pytest
 import yaml
-from mcap_ros2.reader import read_ros2_messages
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 
 STEPS = 9
@@ -23,13 +24,20 @@ def bag(start_for_module, tmp_path_factory: pytest.TempPathFactory) -> pathlib.P
     return metadata.parent
 
 
+def messages(file: pathlib.Path) -> dict[str, list]:
+    """The decoded messages of each topic, in order, by mcap-ros2-support."""
+    found: dict[str, list] = {}
+    with file.open("rb") as stream:
+        for _, channel, _, message in make_reader(stream, decoder_factories=[DecoderFactory()]).iter_decoded_messages():
+            found.setdefault(channel.topic, []).append(message)
+    return found
+
+
 def test_the_metadata_describes_the_file(bag: pathlib.Path) -> None:
     information = yaml.safe_load((bag / "metadata.yaml").read_text())["rosbag2_bagfile_information"]
     assert information["storage_identifier"] == "mcap"
     (name,) = information["relative_file_paths"]
-    counts: dict[str, int] = {}
-    for message in read_ros2_messages(bag / name):
-        counts[message.channel.topic] = counts.get(message.channel.topic, 0) + 1
+    counts = {topic: len(found) for topic, found in messages(bag / name).items()}
     assert information["message_count"] == sum(counts.values())
     listed = {entry["topic_metadata"]["name"]: entry["message_count"] for entry in information["topics_with_message_count"]}
     assert {topic: count for topic, count in listed.items() if count} == counts
@@ -37,21 +45,19 @@ def test_the_metadata_describes_the_file(bag: pathlib.Path) -> None:
 
 def test_mcap_ros2_support_reads_heightmaps_and_actions(bag: pathlib.Path) -> None:
     (file,) = bag.glob("*.mcap")
-    messages = {topic: [] for topic in ("heightmap", "pick_place")}
-    for message in read_ros2_messages(file):
-        messages.setdefault(message.channel.topic.strip("/"), []).append(message.ros_msg)
-    assert len(messages["heightmap"]) == STEPS + 1
-    assert len(messages["pick_place"]) == STEPS
-    for heightmap in messages["heightmap"]:
+    found = messages(file)
+    assert len(found["/heightmap"]) == STEPS + 1
+    assert len(found["/pick_place"]) == STEPS
+    for heightmap in found["/heightmap"]:
         assert len(heightmap.height_m) == heightmap.rows * heightmap.cols
         assert len(heightmap.rgb) == 3 * heightmap.rows * heightmap.cols
 
 
 def test_rosbags_reads_the_same_with_the_definitions_in_the_bag(bag: pathlib.Path) -> None:
     (file,) = bag.glob("*.mcap")
-    expected = [message.ros_msg for message in read_ros2_messages(file) if message.channel.topic.strip("/") == "heightmap"]
+    expected = messages(file)["/heightmap"]
     with AnyReader([bag]) as reader:
-        connections = [connection for connection in reader.connections if connection.topic.strip("/") == "heightmap"]
+        connections = [connection for connection in reader.connections if connection.topic == "/heightmap"]
         found = [reader.deserialize(raw, connection.msgtype) for connection, _, raw in reader.messages(connections)]
     assert len(found) == len(expected)
     for ours, theirs in zip(found, expected, strict=True):

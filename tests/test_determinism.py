@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from mcap.reader import make_reader
 
 # What a run decides. Joint states, clock and images stream at their own pace and are not compared message by message.
-COMPARED = ("heightmap", "goal", "pick_place", "reward")
+COMPARED = ("/heightmap", "/goal", "/pick_place", "/step_result", "/reward")
 
 
 def test_two_runs_of_one_seed_are_bit_identical_under_load(start, tmp_path: pathlib.Path) -> None:
@@ -38,8 +38,10 @@ def run(start, directory: pathlib.Path) -> dict[str, list[bytes]]:
     (file,) = directory.rglob("*.mcap")
     with file.open("rb") as stream:
         for _, channel, message in make_reader(stream).iter_messages():
-            if channel.topic.strip("/") in messages:
-                messages[channel.topic.strip("/")].append(message.data)
+            known = messages.get(channel.topic)
+            # While nothing moves a node may repeat what it said.
+            if known is not None and message.data not in known[-1:]:
+                known.append(message.data)
     return messages
 
 

@@ -1,42 +1,35 @@
-//! Draws a scene.
-use heightmap::Camera;
-use multiravens::render::*;
-use nalgebra::{Isometry3, Vector3};
-fn main() {
-    let mut scene = Scene::new([255, 255, 255]);
-    let table = scene.add_mesh(Mesh::cuboid(Vector3::new(0.5, 1.0, 0.1)));
-    let cube = scene.add_mesh(Mesh::cuboid(Vector3::new(0.04, 0.04, 0.04)));
-    let cyl = scene.add_mesh(Mesh::cylinder(0.04, 0.02, 32));
-    let ball = scene.add_mesh(Mesh::sphere(0.02, 24));
-    let caps = scene.add_mesh(Mesh::capsule(0.02, 0.1, 24));
-    scene.add(table, Isometry3::translation(0.5, 0.0, -0.05), [90, 80, 75]);
-    scene.add(cube, Isometry3::translation(0.5, 0.1, 0.02), [255, 87, 89]);
-    scene.add(cyl, Isometry3::translation(0.4, 0.1, 0.01), [89, 169, 79]);
-    scene.add(
-        ball,
-        Isometry3::translation(0.5, -0.1, 0.02),
-        [78, 121, 167],
-    );
-    scene.add(
-        caps,
-        Isometry3::new(Vector3::new(0.6, -0.2, 0.1), Vector3::new(0.5, 0.5, 0.5)),
-        [237, 201, 72],
-    );
-    let mut r = Rasteriser::new();
-    for camera in &Camera::ravens() {
-        let mut image = RgbdImage::new(&camera.intrinsics);
-        r.render(&scene, camera, &mut image.rgb, &mut image.depth_m)
-            .unwrap();
-        let hit = image.depth_m.iter().filter(|d| **d > 0.0).count();
-        println!("{} {hit} {:?}", camera.name, image.depth_m[240 * 640 + 320]);
-        let out = std::env::args().nth(1).unwrap();
-        image::save_buffer(
-            format!("{out}/{}.png", camera.name),
-            &image.rgb,
-            640,
-            480,
-            image::ColorType::Rgb8,
-        )
-        .unwrap();
+//! Draws a crowded table as the three cameras see it, and the heightmap that they make:
+//! `cargo run --release -p multiravens --example render -- FOLDER`.
+
+use anyhow::{Context, Result};
+use heightmap::{Camera, Fusion, Heightmap, Workspace, picture};
+use multiravens::render::{Rasteriser, RgbdImage, crowded_table};
+use std::path::PathBuf;
+
+fn main() -> Result<()> {
+    let folder = std::env::args_os().nth(1).map(PathBuf::from);
+    let folder = folder.context("expected the folder for the pictures")?;
+    std::fs::create_dir_all(&folder).with_context(|| folder.display().to_string())?;
+    let cameras = Camera::ravens();
+    let mut images = cameras.each_ref().map(|c| RgbdImage::new(&c.intrinsics));
+    let (scene, mut rasteriser) = (crowded_table(), Rasteriser::new());
+    for (camera, image) in cameras.iter().zip(&mut images) {
+        rasteriser.render(&scene, camera, &mut image.rgb, &mut image.depth_m)?;
+        let (width, height) = (camera.intrinsics.width, camera.intrinsics.height);
+        let path = folder.join(format!("{}.png", camera.name));
+        picture::write(&path, &picture::camera(width, height, &image.rgb))?;
+        println!("{}", path.display());
     }
+    let views = [0, 1, 2].map(|i| images[i].view(&cameras[i]));
+    let mut heightmap = Heightmap::new(Workspace::RAVENS);
+    let report = Fusion::default().fuse(&views, &mut heightmap)?;
+    let path = folder.join("heightmap.png");
+    picture::write_heightmap(&path, &heightmap, None)?;
+    println!(
+        "{}: {} views, {:.1} % of the cells seen",
+        path.display(),
+        report.views,
+        100.0 * report.coverage
+    );
+    Ok(())
 }

@@ -47,7 +47,12 @@ impl Stage {
             Self::Doc => run(cargo()
                 .args(["doc", "--workspace", "--no-deps", "--release"])
                 .env("RUSTDOCFLAGS", "-D warnings")),
-            Self::Unit => run(cargo().args(["test", "--workspace", "--release"])),
+            Self::Unit => {
+                run(cargo().args(["test", "--workspace", "--release"]))?;
+                // The networks against numpy, which the environment has.
+                let numpy = ["numpy", "--", "--ignored"];
+                run(cargo().args(["test", "--release", "-p", "gctn", "--lib"]).args(numpy))
+            }
             Self::EndToEnd => {
                 let environment = python::Environment::set_up()?;
                 build_programs()?;

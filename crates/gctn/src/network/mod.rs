@@ -1,6 +1,8 @@
 //! The networks, and what they share.
 
 mod compact;
+#[cfg(test)]
+mod cross_check;
 mod parameters;
 mod resnet43;
 

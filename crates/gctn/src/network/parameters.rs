@@ -42,6 +42,15 @@ impl Builder {
         }
     }
 
+    /// The same in 64-bit floats.
+    #[cfg(test)]
+    pub fn double(self) -> Self {
+        Self {
+            kind: Kind::Double,
+            ..self
+        }
+    }
+
     fn add(&mut self, name: String, tensor: Tensor) -> Tensor {
         let tensor = tensor.to_kind(self.kind);
         self.entries.push((name, tensor.shallow_clone()));

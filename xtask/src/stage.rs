@@ -51,7 +51,9 @@ impl Stage {
                 run(cargo().args(["test", "--workspace", "--release"]))?;
                 // The networks against numpy, which the environment has.
                 let numpy = ["numpy", "--", "--ignored"];
-                run(cargo().args(["test", "--release", "-p", "gctn", "--lib"]).args(numpy))
+                run(cargo()
+                    .args(["test", "--release", "-p", "gctn", "--lib"])
+                    .args(numpy))
             }
             Self::EndToEnd => {
                 let environment = python::Environment::set_up()?;

@@ -12,3 +12,8 @@ mod workspace;
 pub use camera::{Camera, CameraError, Intrinsics};
 pub use fusion::{Fusion, FusionError, FusionReport, View};
 pub use workspace::{Heightmap, HeightmapError, Pixel, Workspace, WorkspaceError};
+
+/// The examples of the README are run as tests.
+#[cfg(doctest)]
+#[doc = include_str!("../README.md")]
+struct Readme;

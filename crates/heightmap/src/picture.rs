@@ -232,6 +232,39 @@ mod tests {
     }
 
     #[test]
+    fn the_highest_score_is_the_brightest_on_a_coarser_grid_too() {
+        let heightmap = Heightmap::new(Workspace::RAVENS);
+        let mut map = vec![0.0; 80 * 40];
+        map[20 * 40 + 30] = 0.7;
+        map[60 * 40 + 10] = 0.1;
+        let picture = scores(&heightmap, 80, 40, &map);
+        let scale = SCALE as u32;
+        let at = |row: u32, col: u32| *picture.get_pixel(scale * col + 1, scale * row + 1);
+        assert_eq!(at(80, 120), Rgb([253, 231, 37]));
+        assert_eq!(at(83, 123), Rgb([253, 231, 37]));
+        assert_eq!(at(84, 124), Rgb([0, 0, 0]));
+        // Merely possible, and still to be seen.
+        assert!(at(240, 40)[1] > 30 && at(240, 40)[1] < at(80, 120)[1]);
+    }
+
+    #[test]
+    fn a_picture_is_read_back_and_one_that_cannot_be_written_is_named() {
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("heightmap.png");
+        let pose = Workspace::RAVENS.pose(Pixel { row: 10, col: 20 }, 0.3);
+        let heightmap = Heightmap::new(Workspace::RAVENS);
+        write_heightmap(&path, &heightmap, Some((&pose, &pose))).unwrap();
+        let picture = image::open(&path).unwrap().into_rgb8();
+        assert_eq!((picture.width(), picture.height()), (2 * 480 + 6, 960));
+        let nowhere = folder.path().join("no/such/folder.png");
+        let refusal = write_heightmap(&nowhere, &heightmap, None).unwrap_err();
+        assert!(
+            refusal.to_string().contains("no/such/folder.png"),
+            "{refusal}"
+        );
+    }
+
+    #[test]
     fn a_pose_that_is_not_finite_is_not_drawn() {
         let workspace = Workspace::RAVENS;
         let mut picture = colors(&Heightmap::new(workspace));

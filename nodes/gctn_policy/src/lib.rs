@@ -133,7 +133,7 @@ struct Outputs {
 impl Outputs {
     fn publish(&self, proposal: Result<PickPlace, String>, answer: &Answer) {
         let took_s = ("network_s", format!("{:.3}", answer.took.as_secs_f64()));
-        match (proposal, &answer.decision) {
+        let reason = match (proposal, &answer.decision) {
             (Ok(proposal), Ok(decision)) => {
                 let header = proposal.header.clone();
                 let message = format!(
@@ -150,13 +150,13 @@ impl Outputs {
                     .publish(picture::markers(&header, observation, decision));
                 self.scores
                     .publish(picture::score_image(header, observation, decision));
+                return;
             }
-            (Err(reason), _) | (_, Err(reason)) => {
-                warn!("no proposal: {reason}");
-                self.node
-                    .diagnostics()
-                    .set("policy", Level::Error, reason.clone(), [took_s]);
-            }
-        }
+            (Err(reason), _) => reason,
+            (_, Err(reason)) => reason.clone(),
+        };
+        warn!("no proposal: {reason}");
+        let diagnostics = self.node.diagnostics();
+        diagnostics.set("policy", Level::Error, reason, [took_s]);
     }
 }

@@ -32,7 +32,7 @@ pub fn markers(header: &Header, observation: &Heightmap, decision: &Decision) ->
         header: header.clone(),
         ns: "pick_place".into(),
         id,
-        type_: kind,
+        r#type: kind,
         action: Marker::ADD,
         pose: Pose {
             orientation: Quaternion {

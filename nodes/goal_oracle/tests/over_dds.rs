@@ -139,7 +139,9 @@ async fn results_and_confirmations_walk_through_a_demonstration() {
             .await
     );
 
-    let propose = |id, step, attempt| {
+    // An operator looks before speaking, and a motion takes its time.
+    let pause = || tokio::time::sleep(Duration::from_millis(200));
+    let propose = async |id, step, attempt| {
         proposals.publish(PickPlace {
             id,
             problem: "placing".into(),
@@ -147,13 +149,14 @@ async fn results_and_confirmations_walk_through_a_demonstration() {
             attempt,
             ..PickPlace::default()
         });
+        pause().await;
     };
-    propose(11, 1, 0);
+    propose(11, 1, 0).await;
     results.publish(result(11, StepResult::REJECTED, 3));
     let again = next_goal(&mut goals, 1, 1, false).await;
     assert_eq!(again.header.stamp.sec, 0);
 
-    propose(12, 1, 1);
+    propose(12, 1, 1).await;
     results.publish(result(12, StepResult::DROPPED, 4));
     confirmations.publish(says(StepConfirmation::RETRY, 12));
     let again = next_goal(&mut goals, 1, 2, false).await;
@@ -178,7 +181,7 @@ async fn results_and_confirmations_walk_through_a_demonstration() {
         refusal.reason
     );
 
-    propose(13, 1, 2);
+    propose(13, 1, 2).await;
     results.publish(result(13, StepResult::PLACED, 5));
     confirmations.publish(says(StepConfirmation::ADVANCE, 13));
     let second = next_goal(&mut goals, 2, 0, false).await;
@@ -187,7 +190,7 @@ async fn results_and_confirmations_walk_through_a_demonstration() {
         (5, 0.03)
     );
 
-    propose(14, 2, 0);
+    propose(14, 2, 0).await;
     results.publish(result(14, StepResult::PLACED, 6));
     confirmations.publish(says(StepConfirmation::ADVANCE, 14));
     next_goal(&mut goals, 2, 0, true).await;

@@ -243,7 +243,7 @@ impl Node {
         topic: &str,
         qos: Qos,
     ) -> Result<Publisher<M>, NodeError> {
-        let (name, topic) = self.topic::<M>(topic, qos)?;
+        let (name, topic) = self.topic::<M>(topic, qos, Direction::Out)?;
         let inner = self
             .ros()
             .create_publisher(&topic, None)
@@ -260,7 +260,7 @@ impl Node {
         topic: &str,
         qos: Qos,
     ) -> Result<Subscription<M>, NodeError> {
-        let (name, topic) = self.topic::<M>(topic, qos)?;
+        let (name, topic) = self.topic::<M>(topic, qos, Direction::In)?;
         let inner = self
             .ros()
             .create_subscription(&topic, None)
@@ -383,7 +383,12 @@ impl Node {
     }
 
     /// A DDS topic with our own policies, as ros2-client's profiles know no resource limits.
-    fn topic<M: Interface>(&self, name: &str, qos: Qos) -> Result<(String, Topic), NodeError> {
+    fn topic<M: Interface>(
+        &self,
+        name: &str,
+        qos: Qos,
+        direction: Direction,
+    ) -> Result<(String, Topic), NodeError> {
         let (full, _) = self.ros_name("topic", name)?;
         let topic = self
             .inner
@@ -392,7 +397,7 @@ impl Node {
             .create_topic(
                 format!("rt{full}"),
                 message_type_name::<M>().dds_msg_type(),
-                &qos.policies(),
+                &qos.policies(direction),
                 TopicKind::NoKey,
             )
             .map_err(|error| NodeError::middleware("topic", &full, format!("{error:?}")))?;

@@ -3,6 +3,8 @@
 use ros2_client::qos::{Durability, History, QosProfile, WhenFull};
 use rustdds::{QosPolicies, QosPolicyBuilder, policy};
 
+use crate::statistics::Direction;
+
 /// How a topic is delivered (REP-2003, and the design's choices).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Qos {
@@ -20,9 +22,14 @@ pub enum Qos {
 }
 
 impl Qos {
-    /// As DDS policies. The resource limit bounds RustDDS's cache, which otherwise keeps 64
-    /// samples of every topic: 400 MB for six camera topics.
-    pub(crate) fn policies(self) -> QosPolicies {
+    /// As DDS policies. The resource limit bounds what RustDDS keeps of a topic: on the reader's
+    /// side everything that has arrived, otherwise 64 samples (400 MB for six camera topics); on the
+    /// writer's side what has not been acknowledged.
+    pub(crate) fn policies(self, direction: Direction) -> QosPolicies {
+        let limit = match direction {
+            Direction::In => self.reader_limit(),
+            Direction::Out => self.writer_limit(),
+        };
         let infinite = rustdds::Duration::INFINITE;
         let builder = QosPolicyBuilder::new()
             .deadline(policy::Deadline(infinite))
@@ -47,9 +54,9 @@ impl Qos {
                 depth: self.depth(),
             })
             .resource_limits(policy::ResourceLimits {
-                max_samples: self.limit(),
+                max_samples: limit,
                 max_instances: 1,
-                max_samples_per_instance: self.limit(),
+                max_samples_per_instance: limit,
             })
             .build()
     }
@@ -75,10 +82,19 @@ impl Qos {
         }
     }
 
-    const fn limit(self) -> i32 {
+    const fn reader_limit(self) -> i32 {
         match self {
             Self::Image | Self::Latched => 8,
             Self::Event | Self::Service => 256,
+        }
+    }
+
+    /// A reader that was killed acknowledges nothing until its lease ends after 50 s. A small stream
+    /// of 50 messages a second gets past that without a wait.
+    const fn writer_limit(self) -> i32 {
+        match self {
+            Self::Image | Self::Latched => 8,
+            Self::Event | Self::Service => 4096,
         }
     }
 }
@@ -90,16 +106,16 @@ mod tests {
     #[test]
     fn only_latched_topics_are_replayed_to_late_joiners() {
         for qos in [Qos::Image, Qos::Event, Qos::Service] {
-            assert!(qos.policies().is_volatile(), "{qos:?}");
+            assert!(qos.policies(Direction::Out).is_volatile(), "{qos:?}");
         }
-        assert!(!Qos::Latched.policies().is_volatile());
+        assert!(!Qos::Latched.policies(Direction::Out).is_volatile());
     }
 
     #[test]
     fn only_images_are_best_effort() {
-        assert!(!Qos::Image.policies().is_reliable());
+        assert!(!Qos::Image.policies(Direction::Out).is_reliable());
         for qos in [Qos::Latched, Qos::Event, Qos::Service] {
-            assert!(qos.policies().is_reliable(), "{qos:?}");
+            assert!(qos.policies(Direction::Out).is_reliable(), "{qos:?}");
         }
     }
 }

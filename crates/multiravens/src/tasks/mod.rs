@@ -1,5 +1,6 @@
 //! Task modules: one file each, one line each in [`REGISTRY`].
 
+mod chaining;
 mod placing;
 mod routing;
 
@@ -13,6 +14,7 @@ use std::fmt;
 
 /// All task modules: the name in problem files, and what reads their parameters.
 pub const REGISTRY: &[(&str, Configure)] = &[
+    ("chaining", chaining::configure),
     ("placing", placing::configure),
     ("routing", routing::configure),
 ];

@@ -96,11 +96,19 @@ impl World {
                 (joint, parent, child)
             })
             .collect();
-        BeadChain {
+        let chain = BeadChain {
             beads,
             closed,
             joints,
-        }
+        };
+        self.chains.push(chain.clone());
+        chain
+    }
+
+    /// The widest gap of the joints of all chains.
+    pub fn widest_joint_error_m(&self) -> f64 {
+        let errors = self.chains.iter().map(|chain| self.joint_error_m(chain));
+        errors.fold(0.0, f64::max)
     }
 
     /// The widest gap of a chain's joints: how far the solver lets it be torn apart.

@@ -76,6 +76,7 @@ struct Body {
 pub struct World {
     physics: PhysicsWorld,
     bodies: Vec<Body>,
+    chains: Vec<BeadChain>,
     suction: Suction,
     steps: u64,
 }
@@ -110,6 +111,7 @@ impl World {
         Self {
             physics,
             bodies: Vec::new(),
+            chains: Vec::new(),
             suction,
             steps: 0,
         }

@@ -1,0 +1,199 @@
+//! A small network over real DDS on loopback: heightmaps and goals in, proposals out.
+
+use std::time::{Duration, Instant};
+
+use gctn::{Compact, ModelCard, Network, NetworkConfig, Storage, Trainer, TrainingConfig};
+use gctn_policy::GctnPolicyParameters;
+use heightmap::Workspace;
+use msgs::{
+    convert,
+    sctn_msgs::{Goal, Heightmap, PickPlace, PrimitiveSettings, StepConfirmation, StepResult},
+    sensor_msgs::Image,
+};
+use node_kit::{
+    Context, Network as DdsNetwork, ParameterSource, Parameters, Qos, RosArguments, Subscription,
+};
+use serde::{Deserialize, Serialize};
+use tokio::time::timeout;
+
+#[derive(Default, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+struct NoParameters {}
+impl Parameters for NoParameters {}
+
+const LIMIT: Duration = Duration::from_secs(30);
+const CELLS: usize = 32;
+
+fn network() -> NetworkConfig {
+    NetworkConfig {
+        rows: CELLS,
+        cols: CELLS,
+        ..NetworkConfig::new(Network::Compact(Compact {
+            channels: [4, 4, 8, 8],
+            window_cells: 5,
+            ..Compact::default()
+        }))
+    }
+}
+
+/// Some scene; another `salt` is another scene.
+fn heightmap(cells: usize, stamp_s: u64, salt: usize) -> Heightmap {
+    let workspace = Workspace {
+        rows: cells,
+        cols: cells,
+        ..Workspace::RAVENS
+    };
+    let mut heightmap = heightmap::Heightmap::new(workspace);
+    for (index, byte) in heightmap.rgb.iter_mut().enumerate() {
+        *byte = (index * (2 * salt + 3) % 251) as u8;
+    }
+    for (index, height_m) in heightmap.height_m.iter_mut().enumerate() {
+        *height_m = (index * (salt + 1) % 17) as f32 / 100.0;
+    }
+    let header = convert::header(Duration::from_secs(stamp_s), "world").unwrap();
+    convert::heightmap_to_msg(heightmap, header, 3, 1.0).unwrap()
+}
+
+fn goal(attempt: u32) -> Goal {
+    Goal {
+        header: convert::header(Duration::from_secs(1), "world").unwrap(),
+        problem: "placing".into(),
+        demonstration: "placing/7".into(),
+        step: 1,
+        step_count: 9,
+        attempt,
+        settings: PrimitiveSettings {
+            clearance_m: 0.1,
+            lift_m: 0.1,
+            travel_m_s: 0.5,
+            carry_m_s: 0.25,
+            descend_m_s: 0.05,
+            acceleration_m_s2: 1.0,
+        },
+        heightmap: heightmap(CELLS, 0, 5),
+        ..Goal::default()
+    }
+}
+
+async fn next(proposals: &mut Subscription<PickPlace>) -> PickPlace {
+    timeout(LIMIT, proposals.recv()).await.expect("a proposal")
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn proposals_follow_goals_rejections_and_changed_scenes() {
+    let directory = tempfile::tempdir().unwrap();
+    let checkpoint = directory.path().join("small.safetensors");
+    Trainer::new(&network(), &TrainingConfig::compact())
+        .unwrap()
+        .save_checkpoint(&checkpoint, Storage::F32, &ModelCard::new())
+        .unwrap();
+    let context = Context::new(DdsNetwork {
+        domain_id: 53,
+        localhost_only: true,
+    });
+    let (node, _) = context
+        .node::<NoParameters>("others", &RosArguments::default())
+        .unwrap();
+    let heightmaps = node
+        .publisher::<Heightmap>("heightmap", Qos::Latched)
+        .unwrap();
+    let goals = node.publisher::<Goal>("goal", Qos::Latched).unwrap();
+    let confirmations = node
+        .publisher::<StepConfirmation>("step_confirmation", Qos::Event)
+        .unwrap();
+    let results = node
+        .publisher::<StepResult>("step_result", Qos::Event)
+        .unwrap();
+    let mut proposals = node
+        .subscription::<PickPlace>("pick_place", Qos::Event)
+        .unwrap();
+    let mut scores = node
+        .subscription::<Image>("pick_place/scores", Qos::Latched)
+        .unwrap();
+    let arguments = RosArguments {
+        parameters: vec![ParameterSource::Argument {
+            node: None,
+            name: "checkpoint".into(),
+            value: checkpoint.display().to_string(),
+        }],
+        ..RosArguments::default()
+    };
+    let policy = context
+        .start(
+            "gctn_policy",
+            &arguments,
+            |node, parameters: GctnPolicyParameters| gctn_policy::run(node, parameters),
+        )
+        .unwrap();
+
+    // Of another size: no proposal, and the node lives on.
+    goals.publish(goal(0));
+    heightmaps.publish(heightmap(CELLS / 2, 1, 0));
+    let none = timeout(Duration::from_secs(2), proposals.recv()).await;
+    assert!(none.is_err(), "{none:?}");
+
+    heightmaps.publish(heightmap(CELLS, 2, 0));
+    let first = next(&mut proposals).await;
+    assert_eq!(
+        (first.step, first.attempt, first.header.stamp.sec),
+        (1, 0, 2)
+    );
+    assert_eq!(first.settings, goal(0).settings);
+    let image = timeout(LIMIT, scores.recv()).await.expect("score image");
+    assert_eq!(image.width as usize, 2 * CELLS);
+
+    // Rejected: the same goal again, a further attempt, another pick.
+    goals.publish(goal(1));
+    let second = next(&mut proposals).await;
+    assert_eq!(
+        (second.step, second.attempt, second.header.stamp.sec),
+        (1, 1, 2)
+    );
+    let distance = (first.pick.x - second.pick.x).hypot(first.pick.y - second.pick.y);
+    assert!(distance > 0.02, "{distance}");
+
+    // A changed scene supersedes it; the time is all but the small network's.
+    let start = Instant::now();
+    heightmaps.publish(heightmap(CELLS, 3, 1));
+    let third = next(&mut proposals).await;
+    println!(
+        "heightmap to proposal: {:.1} ms",
+        start.elapsed().as_secs_f64() * 1e3
+    );
+    assert_ne!(third.id, second.id);
+
+    // Approved and moved: what is seen then makes no proposal.
+    confirmations.publish(StepConfirmation {
+        proposal_id: third.id,
+        decision: StepConfirmation::APPROVE,
+        ..StepConfirmation::default()
+    });
+    results.publish(StepResult {
+        proposal_id: third.id,
+        outcome: StepResult::PLACED,
+        ..StepResult::default()
+    });
+    tokio::time::sleep(Duration::from_millis(300)).await;
+    heightmaps.publish(heightmap(CELLS, 4, 2));
+    let none = timeout(Duration::from_secs(1), proposals.recv()).await;
+    assert!(none.is_err(), "{none:?}");
+    context.shutdown();
+    policy.await.unwrap().unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn without_a_checkpoint_the_node_refuses_to_start() {
+    let context = Context::new(DdsNetwork {
+        domain_id: 53,
+        localhost_only: true,
+    });
+    let policy = context
+        .start(
+            "gctn_policy",
+            &RosArguments::default(),
+            |node, parameters: GctnPolicyParameters| gctn_policy::run(node, parameters),
+        )
+        .unwrap();
+    let error = policy.await.unwrap().unwrap_err().to_string();
+    assert!(error.contains("checkpoint"), "{error}");
+}

@@ -277,9 +277,6 @@ impl Executor {
             "{decision:?} of proposal {id} by `{}`",
             message.operator_name
         );
-        if decision == Decision::Approve && !self.parameters.require_approval {
-            self.automatic = true;
-        }
         self.confirm(id, decision, None);
     }
 
@@ -310,7 +307,11 @@ impl Executor {
             |status, proposal| rehearse(arm, status, proposal),
         );
         match verdict {
-            Verdict::Move(proposal) => self.begin(*proposal),
+            Verdict::Move(proposal) => {
+                // After a stop or a fault an approval lets things go on.
+                self.automatic = !self.parameters.require_approval;
+                self.begin(*proposal);
+            }
             Verdict::Cancel => {
                 if let Some(motion) = &self.motion {
                     motion.stop.cancel();

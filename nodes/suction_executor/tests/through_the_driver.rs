@@ -548,5 +548,21 @@ async fn without_require_approval_a_proposal_moves_once_by_itself_until_a_stop()
     );
     tokio::time::sleep(Duration::from_secs(2)).await;
     assert_eq!(bench.joints().await.position, before);
+    // An approval that is refused changes nothing about that, one that holds lets it go on.
+    bench.decide(99, StepConfirmation::APPROVE);
+    let result = bench.result().await;
+    assert_eq!(
+        (result.proposal_id, result.outcome),
+        (99, StepResult::REFUSED)
+    );
+    assert_eq!(bench.joints().await.position, before);
+    bench.decide(2, StepConfirmation::APPROVE);
+    let result = bench.result().await;
+    assert_eq!(
+        (result.proposal_id, result.outcome),
+        (2, StepResult::PLACED),
+        "{}",
+        result.reason
+    );
     bench.stop().await;
 }

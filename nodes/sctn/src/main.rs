@@ -3,6 +3,7 @@
 mod bench;
 mod demos;
 mod evaluate;
+mod launch;
 mod picture;
 mod progress;
 mod root;
@@ -33,17 +34,14 @@ enum Command {
     Train(train::Train),
     /// Evaluate a policy on held-out episodes
     Evaluate(evaluate::Evaluate),
+    /// Launch the graph on a simulated cell, under an operator
+    Launch(launch::Launch),
     /// Draw what the cameras, the fusion, the demonstrator and the policy make of a problem
     Picture(picture::Picture),
 }
 
 fn main() -> Result<()> {
-    tracing_subscriber::fmt()
-        .with_env_filter(
-            tracing_subscriber::EnvFilter::try_from_default_env().unwrap_or_else(|_| "info".into()),
-        )
-        .with_writer(std::io::stderr)
-        .init();
+    node_kit::logging::init(&[])?;
     let arguments = Arguments::parse();
     let root = Root::find(arguments.root)?;
     match arguments.command {
@@ -51,6 +49,7 @@ fn main() -> Result<()> {
         Command::Demos(demos) => demos.run(&root),
         Command::Train(train) => train.run(&root),
         Command::Evaluate(evaluate) => evaluate.run(&root),
+        Command::Launch(launch) => launch.run(&root),
         Command::Picture(picture) => picture.run(&root),
     }
 }

@@ -13,6 +13,9 @@ use std::io::Write;
 use std::path::{Path, PathBuf};
 use std::sync::Mutex;
 
+/// Gradient steps between lines of progress where there is no terminal.
+const LOG_EVERY: u64 = 50;
+
 /// Arguments of `sctn train`.
 #[derive(Args)]
 pub struct Train {
@@ -83,6 +86,15 @@ impl Train {
                 pick / f64::from(count),
                 place / f64::from(count)
             ));
+            // Where there is no terminal to draw a bar on, a line now and then.
+            if bar.is_hidden() && training.step().is_multiple_of(LOG_EVERY) {
+                tracing::info!(
+                    "step {}: {}, {:?} left",
+                    training.step(),
+                    bar.message(),
+                    bar.eta()
+                );
+            }
             if training.is_snapshot_due() {
                 let checkpoint = training.save_snapshot(&self.card(&training))?;
                 let mut snapshot = Snapshot {

@@ -16,7 +16,13 @@ pub struct Settings {
     pub checkpoint: PathBuf,
 }
 
-const NODES: [&str; 5] = ["sim_workcell", "camera_fusion", "goal_oracle", "gctn_policy", "suction_executor"];
+const NODES: [&str; 5] = [
+    "sim_workcell",
+    "camera_fusion",
+    "goal_oracle",
+    "gctn_policy",
+    "suction_executor",
+];
 
 impl Settings {
     fn parameters(&self, root: &Root, node: &str) -> Vec<(&'static str, String)> {
@@ -38,9 +44,16 @@ impl Settings {
     /// The command line of a node, as `ros2 run` would give it.
     fn arguments(&self, root: &Root, node: &str) -> Vec<String> {
         let file = root.join(format!("config/{node}.yaml"));
-        let mut arguments = vec!["--ros-args".to_owned(), "--params-file".into(), file.display().to_string()];
+        let mut arguments = vec![
+            "--ros-args".to_owned(),
+            "--params-file".into(),
+            file.display().to_string(),
+        ];
         let parameters = self.parameters(root, node);
-        for (name, value) in parameters.iter().chain([&("use_sim_time", (node != "sim_workcell").to_string())]) {
+        for (name, value) in parameters
+            .iter()
+            .chain([&("use_sim_time", "true".to_owned())])
+        {
             arguments.extend(["-p".to_owned(), format!("{name}:={value}")]);
         }
         arguments
@@ -50,7 +63,10 @@ impl Settings {
 /// The running nodes.
 pub enum Graph {
     Composed(Vec<(&'static str, JoinHandle<Result<()>>)>),
-    Processes { children: Vec<(&'static str, Child)>, logs: PathBuf },
+    Processes {
+        children: Vec<(&'static str, Child)>,
+        logs: PathBuf,
+    },
 }
 
 impl Graph {
@@ -80,7 +96,10 @@ impl Graph {
         for node in NODES {
             let executable = folder.join(node);
             if !executable.is_file() {
-                bail!("{}: no such executable; build the workspace first", executable.display());
+                bail!(
+                    "{}: no such executable; build the workspace first",
+                    executable.display()
+                );
             }
             let log = logs.join(format!("{node}.log"));
             let file = std::fs::File::create(&log).with_context(|| log.display().to_string())?;
@@ -95,14 +114,19 @@ impl Graph {
                 .with_context(|| executable.display().to_string())?;
             children.push((node, child));
         }
-        Ok(Self::Processes { children, logs: logs.to_owned() })
+        Ok(Self::Processes {
+            children,
+            logs: logs.to_owned(),
+        })
     }
 
     /// Waits until a node ends, which none should while a run lasts; says which and why.
     pub async fn failure(&mut self) -> anyhow::Error {
         match self {
             Self::Composed(tasks) => {
-                let ends = tasks.iter_mut().map(|(node, task)| Box::pin(async move { (*node, task.await) }));
+                let ends = tasks
+                    .iter_mut()
+                    .map(|(node, task)| Box::pin(async move { (*node, task.await) }));
                 let ((node, end), _, _) = futures::future::select_all(ends).await;
                 match end {
                     Ok(Ok(())) => anyhow::anyhow!("{node} ended"),
@@ -111,14 +135,23 @@ impl Graph {
                 }
             }
             Self::Processes { children, logs } => {
-                let ends = children.iter_mut().map(|(node, child)| Box::pin(async move { (*node, child.wait().await) }));
+                let ends = children
+                    .iter_mut()
+                    .map(|(node, child)| Box::pin(async move { (*node, child.wait().await) }));
                 let ((node, status), _, _) = futures::future::select_all(ends).await;
                 let log = logs.join(format!("{node}.log"));
                 let text = std::fs::read_to_string(&log).unwrap_or_default();
                 let mut last: Vec<_> = text.lines().rev().take(5).collect();
                 last.reverse();
-                let status = status.map_or_else(|error| error.to_string(), |status: ExitStatus| status.to_string());
-                anyhow::anyhow!("{node} ended ({status}), see {}:\n{}", log.display(), last.join("\n"))
+                let status = status.map_or_else(
+                    |error| error.to_string(),
+                    |status: ExitStatus| status.to_string(),
+                );
+                anyhow::anyhow!(
+                    "{node} ended ({status}), see {}:\n{}",
+                    log.display(),
+                    last.join("\n")
+                )
             }
         }
     }
@@ -136,7 +169,9 @@ impl Graph {
             }
             Self::Processes { mut children, .. } => {
                 for (_, child) in &children {
-                    let pid = child.id().and_then(|id| rustix::process::Pid::from_raw(id as i32));
+                    let pid = child
+                        .id()
+                        .and_then(|id| rustix::process::Pid::from_raw(id as i32));
                     // A child that has ended has no id: nothing to signal.
                     if let Some(pid) = pid {
                         let _ = rustix::process::kill_process(pid, rustix::process::Signal::TERM);

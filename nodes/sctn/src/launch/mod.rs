@@ -10,6 +10,7 @@ use anyhow::{Context as _, Result, bail};
 use clap::Args;
 use graph::{Graph, Settings};
 use heightmap::Heightmap;
+use msgs::convert::heightmap_from_msg;
 use msgs::sctn_msgs::{Goal, PickPlace, Reward, StepConfirmation, StepResult};
 use multiravens::Environment;
 use node_kit::{Context, Network, Node, Parameters, Qos, RosArguments, wait_for_end};
@@ -81,10 +82,16 @@ impl Launch {
             environment.max_steps()
         };
         let temporary = tempfile::tempdir().context("folder for the demonstration")?;
-        let folder = self.record.clone().unwrap_or_else(|| temporary.path().to_owned());
+        let folder = self
+            .record
+            .clone()
+            .unwrap_or_else(|| temporary.path().to_owned());
         let bag = folder.join("run");
         if bag.exists() {
-            bail!("{}: already holds a run; name another folder", folder.display());
+            bail!(
+                "{}: already holds a run; name another folder",
+                folder.display()
+            );
         }
         std::fs::create_dir_all(&folder).with_context(|| folder.display().to_string())?;
         println!("demonstrating {} with seed {}", self.problem, self.seed);
@@ -96,16 +103,26 @@ impl Launch {
             problem: self.problem.clone(),
             seed: self.seed,
             demonstration: std::path::absolute(shown)?,
-            checkpoint: self.checkpoint.clone().unwrap_or_else(|| root.shipped_checkpoint()),
+            checkpoint: self
+                .checkpoint
+                .clone()
+                .unwrap_or_else(|| root.shipped_checkpoint()),
         };
         gctn::set_threads(1);
-        let runtime = tokio::runtime::Builder::new_multi_thread().enable_all().build().context("tokio runtime")?;
+        let runtime = tokio::runtime::Builder::new_multi_thread()
+            .enable_all()
+            .build()
+            .context("tokio runtime")?;
         let report = runtime.block_on(self.session(root, &settings, &folder, max_steps));
         runtime.shutdown_timeout(Duration::from_millis(500));
         let report = report?;
         println!(
             "{} after {} steps, reward {:.3}",
-            if report.completed { "completed" } else { "not completed" },
+            if report.completed {
+                "completed"
+            } else {
+                "not completed"
+            },
             report.steps,
             report.reward
         );
@@ -122,11 +139,21 @@ impl Launch {
         Ok(())
     }
 
-    async fn session(&self, root: &Root, settings: &Settings, folder: &Path, max_steps: usize) -> Result<Report> {
-        let context = Context::new(Network::from_environment()?)?;
+    async fn session(
+        &self,
+        root: &Root,
+        settings: &Settings,
+        folder: &Path,
+        max_steps: usize,
+    ) -> Result<Report> {
+        let context = Context::new(Network::from_environment()?);
         let (node, _) = context.node::<NoParameters>("sctn_launch", &RosArguments::default())?;
         // Subscriptions stand before the nodes start: nothing of the run is missed.
-        let recorder = self.record.as_ref().map(|_| Recorder::start(&node, &folder.join("run"), self.record_images)).transpose()?;
+        let recorder = self
+            .record
+            .as_ref()
+            .map(|_| Recorder::start(&node, &folder.join("run"), self.record_images))
+            .transpose()?;
         let mut desk = Desk::new(&node)?;
         let mut graph = if self.processes {
             Graph::spawn(root, settings, &folder.join("logs"))?
@@ -143,12 +170,26 @@ impl Launch {
             Some(recorder) => Some(recorder.finish().await?),
             None => None,
         };
-        if let Some(heightmap) = desk.last_heightmap()? && self.record.is_some() {
+        if let Some(heightmap) = desk.last_heightmap()?
+            && self.record.is_some()
+        {
             heightmap::picture::write_heightmap(&folder.join("heightmap.png"), &heightmap, None)?;
         }
         ended?;
-        let Desk { steps, total_reward, complete, .. } = desk;
-        Ok(Report { problem: self.problem.clone(), seed: self.seed, completed: complete, reward: total_reward, steps, bag })
+        let Desk {
+            steps,
+            total_reward,
+            complete,
+            ..
+        } = desk;
+        Ok(Report {
+            problem: self.problem.clone(),
+            seed: self.seed,
+            completed: complete,
+            reward: total_reward,
+            steps,
+            bag,
+        })
     }
 }
 
@@ -192,8 +233,12 @@ impl Desk {
         })
     }
 
-    fn last_heightmap(&self) -> Result<Option<Heightmap>> {
-        self.last_heightmap.as_ref().map(Heightmap::try_from).transpose().context("topic heightmap")
+    fn last_heightmap(&mut self) -> Result<Option<Heightmap>> {
+        let message = self.last_heightmap.take();
+        message
+            .map(heightmap_from_msg)
+            .transpose()
+            .context("topic heightmap")
     }
 
     /// Until the run is over: the goal is complete, or the steps are used up.
@@ -204,7 +249,6 @@ impl Desk {
                 result = self.results.recv() => self.result(result)?,
                 reward = self.rewards.recv() => {
                     self.total_reward = reward.total;
-                    self.complete = reward.complete;
                     self.operator.reward(reward)
                 }
                 goal = self.goals.recv() => {
@@ -235,7 +279,10 @@ impl Desk {
             tracing::warn!("proposal {} refused: {}", result.proposal_id, result.reason);
             self.refusals += 1;
             if self.refusals >= MAX_REFUSALS {
-                bail!("{MAX_REFUSALS} refusals in a row, the last one: {}", result.reason);
+                bail!(
+                    "{MAX_REFUSALS} refusals in a row, the last one: {}",
+                    result.reason
+                );
             }
         }
         Ok(self.operator.result(result))
@@ -250,6 +297,7 @@ impl Desk {
             }
             Question::Confirm(result, reward) => {
                 self.steps += 1;
+                self.complete = reward.complete;
                 self.refusals = 0;
                 println!(
                     "    {}, delta reward {:+.3}, reward {:.3}, {:.1} s",
@@ -269,14 +317,25 @@ impl Desk {
                 self.node.spawn_blocking(move || terminal(&ask)).await??
             }
         };
-        let mut confirmation = StepConfirmation { proposal_id, decision, operator_name: "sctn launch".into(), ..Default::default() };
+        let mut confirmation = StepConfirmation {
+            proposal_id,
+            decision,
+            operator_name: "sctn launch".into(),
+            ..Default::default()
+        };
         confirmation.header.stamp = self.node.now();
         self.confirmations.publish(confirmation);
         Ok(())
     }
 
     fn describe(&self, proposal: &PickPlace) {
-        let PickPlace { step, attempt, pick, place, .. } = proposal;
+        let PickPlace {
+            step,
+            attempt,
+            pick,
+            place,
+            ..
+        } = proposal;
         println!(
             "step {step}/{} attempt {attempt}: {} pick ({:.3}, {:.3}) place ({:.3}, {:.3}, {:.0} deg), scores {:.2} {:.2}",
             self.step_count,
@@ -293,7 +352,9 @@ impl Desk {
 
     /// The reward of the last step comes before its heightmap.
     async fn wait_for_last_heightmap(&mut self) {
-        if let Ok(heightmap) = tokio::time::timeout(Duration::from_secs(2), self.heightmaps.recv()).await {
+        if let Ok(heightmap) =
+            tokio::time::timeout(Duration::from_secs(2), self.heightmaps.recv()).await
+        {
             self.last_heightmap = Some(heightmap);
         }
     }
@@ -305,11 +366,19 @@ fn terminal(question: &Question) -> Result<u8> {
     let (text, answers): (&str, &[(&str, u8)]) = match question {
         Question::Approve(_) => (
             "carry it out? [y]es, [n]o, [s]top",
-            &[("y", StepConfirmation::APPROVE), ("n", StepConfirmation::REJECT), ("s", StepConfirmation::STOP)],
+            &[
+                ("y", StepConfirmation::APPROVE),
+                ("n", StepConfirmation::REJECT),
+                ("s", StepConfirmation::STOP),
+            ],
         ),
         Question::Confirm(..) => (
             "did the step succeed? [y]es, [n]o: try again, [s]top",
-            &[("y", StepConfirmation::ADVANCE), ("n", StepConfirmation::RETRY), ("s", StepConfirmation::STOP)],
+            &[
+                ("y", StepConfirmation::ADVANCE),
+                ("n", StepConfirmation::RETRY),
+                ("s", StepConfirmation::STOP),
+            ],
         ),
     };
     loop {
@@ -319,7 +388,10 @@ fn terminal(question: &Question) -> Result<u8> {
         if std::io::stdin().read_line(&mut line)? == 0 {
             bail!("the terminal was closed: nobody is left to decide");
         }
-        if let Some((_, decision)) = answers.iter().find(|(key, _)| *key == line.trim().to_lowercase()) {
+        if let Some((_, decision)) = answers
+            .iter()
+            .find(|(key, _)| *key == line.trim().to_lowercase())
+        {
             return Ok(*decision);
         }
     }

@@ -35,7 +35,11 @@ pub struct Operator {
 impl Operator {
     /// A new proposal supersedes the one before.
     pub fn proposal(&mut self, proposal: PickPlace) -> Option<Question> {
-        if self.proposal.as_ref().is_some_and(|known| known.id == proposal.id) {
+        if self
+            .proposal
+            .as_ref()
+            .is_some_and(|known| known.id == proposal.id)
+        {
             return None;
         }
         self.proposal = Some(proposal.clone());
@@ -45,7 +49,12 @@ impl Operator {
 
     /// The executor's word on the present proposal.
     pub fn result(&mut self, result: StepResult) -> Option<Question> {
-        if self.proposal.as_ref().is_some_and(|proposal| proposal.id == result.proposal_id) && moved(&result) {
+        if self
+            .proposal
+            .as_ref()
+            .is_some_and(|proposal| proposal.id == result.proposal_id)
+            && moved(&result)
+        {
             self.result = Some(result);
         }
         self.confirm()
@@ -60,7 +69,10 @@ impl Operator {
     /// A step is judged by a reward measured after it: younger than the observation it was proposed from.
     fn confirm(&mut self) -> Option<Question> {
         let seen = ns_from_stamp(&self.proposal.as_ref()?.header.stamp);
-        let reward = self.reward.as_ref().filter(|reward| ns_from_stamp(&reward.header.stamp) > seen)?;
+        let reward = self
+            .reward
+            .as_ref()
+            .filter(|reward| ns_from_stamp(&reward.header.stamp) > seen)?;
         Some(Question::Confirm(self.result.take()?, reward.clone()))
     }
 }
@@ -108,19 +120,29 @@ mod tests {
     use node_kit::stamp_from_ns;
 
     fn proposal(id: u64, stamp_ns: i64) -> PickPlace {
-        let mut proposal = PickPlace { id, ..PickPlace::default() };
+        let mut proposal = PickPlace {
+            id,
+            ..PickPlace::default()
+        };
         proposal.header.stamp = stamp_from_ns(stamp_ns);
         proposal
     }
 
     fn reward(delta: f64, stamp_ns: i64) -> Reward {
-        let mut reward = Reward { delta, ..Reward::default() };
+        let mut reward = Reward {
+            delta,
+            ..Reward::default()
+        };
         reward.header.stamp = stamp_from_ns(stamp_ns);
         reward
     }
 
     fn result(proposal_id: u64) -> StepResult {
-        StepResult { proposal_id, outcome: StepResult::PLACED, ..StepResult::default() }
+        StepResult {
+            proposal_id,
+            outcome: StepResult::PLACED,
+            ..StepResult::default()
+        }
     }
 
     #[test]
@@ -157,7 +179,13 @@ mod tests {
         let mut operator = Operator::default();
         operator.proposal(proposal(7, 10));
         operator.reward(reward(0.1, 20));
-        assert_eq!(operator.result(StepResult { outcome: StepResult::REFUSED, ..result(7) }), None);
+        assert_eq!(
+            operator.result(StepResult {
+                outcome: StepResult::REFUSED,
+                ..result(7)
+            }),
+            None
+        );
         assert_eq!(operator.result(result(6)), None);
     }
 }

@@ -35,7 +35,11 @@ impl Recorder {
     /// Begins a bag; `images` also records what the cameras send.
     pub fn start(node: &Node, path: &Path, images: bool) -> Result<Self> {
         let bag = BagWriter::create(path, Compression::default()).context("begin the bag")?;
-        let mut topics = Topics { node, bag, started: Vec::new() };
+        let mut topics = Topics {
+            node,
+            bag,
+            started: Vec::new(),
+        };
         topics.record::<Heightmap>("heightmap", Qos::Latched, false)?;
         topics.record::<Goal>("goal", Qos::Latched, false)?;
         topics.record::<PickPlace>("pick_place", Qos::Event, false)?;
@@ -49,28 +53,46 @@ impl Recorder {
         for camera in CAMERAS.into_iter().filter(|_| images) {
             topics.record::<Image>(&format!("{camera}/color/image_raw"), Qos::Image, false)?;
             topics.record::<Image>(&format!("{camera}/depth/image_rect_raw"), Qos::Image, false)?;
-            topics.record::<CameraInfo>(&format!("{camera}/color/camera_info"), Qos::Image, false)?;
+            topics.record::<CameraInfo>(
+                &format!("{camera}/color/camera_info"),
+                Qos::Image,
+                false,
+            )?;
         }
-        let Topics { mut bag, started, .. } = topics;
+        let Topics {
+            mut bag, started, ..
+        } = topics;
         let (queue, arrivals) = mpsc::channel::<Write>();
-        let writer = std::thread::Builder::new().name("recorder".into()).spawn(move || {
-            for write in arrivals {
-                write(&mut bag)?;
-            }
-            Ok(bag)
-        })?;
+        let writer = std::thread::Builder::new()
+            .name("recorder".into())
+            .spawn(move || {
+                for write in arrivals {
+                    write(&mut bag)?;
+                }
+                Ok(bag)
+            })?;
         for start in started {
             start(queue.clone());
         }
-        Ok(Self { path: path.to_owned(), queue, writer })
+        Ok(Self {
+            path: path.to_owned(),
+            queue,
+            writer,
+        })
     }
 
     /// Completes the bag, once the node's tasks have ended; gives its path.
     pub async fn finish(self) -> Result<PathBuf> {
-        let Self { path, queue, writer } = self;
+        let Self {
+            path,
+            queue,
+            writer,
+        } = self;
         drop(queue);
         let bag = tokio::task::spawn_blocking(move || writer.join()).await?;
-        let bag = bag.map_err(|_| anyhow::anyhow!("the recorder's thread panicked"))?.context("record the run")?;
+        let bag = bag
+            .map_err(|_| anyhow::anyhow!("the recorder's thread panicked"))?
+            .context("record the run")?;
         bag.finish().context("complete the bag")?;
         Ok(path)
     }
@@ -78,7 +100,12 @@ impl Recorder {
 
 impl Topics<'_> {
     /// Writes every message of a topic, at the time it arrives.
-    fn record<M: Interface + Send + 'static>(&mut self, name: &str, qos: Qos, flush: bool) -> Result<()> {
+    fn record<M: Interface + Send + 'static>(
+        &mut self,
+        name: &str,
+        qos: Qos,
+        flush: bool,
+    ) -> Result<()> {
         let offered = match qos {
             Qos::Image => bags::Qos::BEST_EFFORT,
             Qos::Latched => bags::Qos::LATCHED,
@@ -91,7 +118,9 @@ impl Topics<'_> {
             node.spawn(async move {
                 loop {
                     let message = subscription.recv().await;
-                    let time = SystemTime::now().duration_since(UNIX_EPOCH).unwrap_or(Duration::ZERO);
+                    let time = SystemTime::now()
+                        .duration_since(UNIX_EPOCH)
+                        .unwrap_or(Duration::ZERO);
                     let write: Write = Box::new(move |bag| {
                         bag.write(topic, time, &message)?;
                         if flush {

@@ -36,7 +36,7 @@ const LOOK_PERIOD: Duration = Duration::from_millis(250);
 /// What a camera has sent.
 enum Arrival {
     Image(usize, Stream, Image),
-    Info(usize, CameraInfo),
+    Info(usize, Box<CameraInfo>),
 }
 
 /// Runs the node.
@@ -157,7 +157,11 @@ impl FusionNode {
         node.spawn(async move {
             loop {
                 let info = subscription.recv().await;
-                if arrivals.send(Arrival::Info(index, info)).await.is_err() {
+                if arrivals
+                    .send(Arrival::Info(index, Box::new(info)))
+                    .await
+                    .is_err()
+                {
                     return;
                 }
             }

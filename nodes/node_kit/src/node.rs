@@ -142,11 +142,13 @@ impl Node {
                 shutdown_observed: AtomicBool::new(false),
             }),
         };
-        node.spawn_background(async move {
+        // Not `spawn`: it ends when the ROS node is dropped, which tells it so.
+        let spinning = async move {
             if let Err(error) = spinner.spin().await {
                 error!("discovery and parameter services stopped: {error}");
             }
-        });
+        };
+        tokio::spawn(spinning.instrument(node.inner.span.clone()));
         node.follow_clock()?;
         node.publish_diagnostics()?;
         Ok(node)

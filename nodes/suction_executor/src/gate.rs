@@ -151,6 +151,8 @@ pub struct Gate {
     /// Oldest first; the last is the newest proposal's.
     fates: VecDeque<(u64, Fate)>,
     moving: Option<u64>,
+    /// The arm is on its way home at an operator's call.
+    homing: bool,
     /// Observations from before the end of the last motion are no ground to move on.
     moved_until: Option<Duration>,
 }
@@ -165,6 +167,7 @@ impl Gate {
             newest: None,
             fates: VecDeque::new(),
             moving: None,
+            homing: false,
             moved_until: None,
         }
     }
@@ -263,11 +266,30 @@ impl Gate {
         }
     }
 
-    /// The motion of [`Verdict::Move`] has ended; `until` is the ROS time from which on
-    /// observations show its result.
+    /// Asks whether the arm may go home, as an operator has called for; [`Self::finish`] has to
+    /// follow where it may.
+    ///
+    /// # Errors
+    /// Says why not.
+    pub fn go_home(&mut self, status: &DriverStatus, now: Duration) -> Result<(), String> {
+        if let Some(id) = self.moving {
+            return Err(format!("proposal {id} is being carried out"));
+        }
+        if let Some(obstacle) = status.obstacle(now, self.rules.status_max_age) {
+            return Err(obstacle);
+        }
+        self.homing = true;
+        Ok(())
+    }
+
+    /// The motion of [`Verdict::Move`] or [`Self::go_home`] has ended; `until` is the ROS time from
+    /// which on observations show its result.
     pub fn finish(&mut self, until: Duration) {
-        if let Some(id) = self.moving.take() {
+        let moved = self.moving.take();
+        if let Some(id) = moved {
             self.set_fate(id, Fate::Done);
+        }
+        if moved.is_some() || std::mem::take(&mut self.homing) {
             self.moved_until = Some(until);
         }
     }
@@ -287,6 +309,11 @@ impl Gate {
         if let Some(moving) = self.moving {
             return Verdict::refuse(format!(
                 "proposal {id} was approved while proposal {moving} is being carried out"
+            ));
+        }
+        if self.homing {
+            return Verdict::refuse(format!(
+                "proposal {id} was approved while the arm is on its way home"
             ));
         }
         // Only the newest proposal is open.
@@ -336,7 +363,7 @@ impl Gate {
     /// A stop is honoured whatever proposal it names.
     fn stop(&mut self, id: u64) -> Verdict {
         let withdrawn = self.set_fate_of_open(Fate::Withdrawn);
-        if self.moving.is_some() {
+        if self.moving.is_some() || self.homing {
             return Verdict::Cancel;
         }
         match self.fate(id) {
@@ -852,6 +879,33 @@ mod tests {
         assert_eq!(decide(&mut gate, 7, Decision::Stop), Verdict::Nothing);
         let verdict = decide(&mut gate, 99, Decision::Stop);
         assert_refused(&gate, verdict, &["99", "unknown"]);
+    }
+
+    #[test]
+    fn the_arm_goes_home_at_a_call_when_nothing_else_moves() {
+        let mut gate = gate();
+        let stopped = DriverStatus {
+            safety_mode: Some(3),
+            ..ready(NOW)
+        };
+        let reason = gate.go_home(&stopped, NOW).unwrap_err();
+        assert!(reason.contains("PROTECTIVE_STOP"), "{reason}");
+        gate.go_home(&ready(NOW), NOW).unwrap();
+        let verdict = approve(&mut gate, 7);
+        assert_refused(&gate, verdict, &["7", "on its way home"]);
+        assert_eq!(decide(&mut gate, 99, Decision::Stop), Verdict::Cancel);
+        gate.finish(Duration::from_secs(9));
+        // The stop has withdrawn what was proposed, and the old observation is none any more.
+        gate.propose(8, Ok(proposal(8)));
+        let verdict = approve(&mut gate, 8);
+        assert_refused(&gate, verdict, &["8", "9.000 s"]);
+        gate.observe(Duration::from_secs(9), Heightmap::new(Workspace::RAVENS));
+        let mut fresh = proposal(9);
+        fresh.stamp = Duration::from_secs(9);
+        gate.propose(9, Ok(fresh));
+        assert!(matches!(approve(&mut gate, 9), Verdict::Move(_)));
+        let reason = gate.go_home(&ready(NOW), NOW).unwrap_err();
+        assert!(reason.contains("proposal 9"), "{reason}");
     }
 
     #[test]

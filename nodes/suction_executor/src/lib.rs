@@ -5,6 +5,7 @@
 
 mod driver;
 pub mod gate;
+mod home;
 mod node;
 mod parameters;
 mod rehearsal;

@@ -11,9 +11,10 @@ use msgs::convert::{self, ConvertError};
 use msgs::sctn_msgs;
 use msgs::sensor_msgs::JointState;
 use msgs::std_msgs::Bool;
+use msgs::std_srvs::{Trigger, TriggerResponse};
 use msgs::ur_dashboard_msgs::{RobotMode, SafetyMode};
 use msgs::ur_msgs::{Digital, IOStates};
-use node_kit::{Level, Node, Publisher, Qos, Subscription};
+use node_kit::{Level, Node, Publisher, Qos, RequestId, ServiceServer, Subscription};
 use pick_place::{ExecuteError, Outcome, Phase, PickPlace};
 use tokio::runtime::Handle;
 use tokio::sync::watch;
@@ -24,12 +25,15 @@ use ur5::WorkCell;
 
 use crate::driver::{DriverError, DriverRobot, Link};
 use crate::gate::{Answer, Decision, Gate, Proposal, Proposed, Rules, Verdict};
+use crate::home::go_home;
 use crate::parameters::{Driver, SuctionExecutorParameters};
 use crate::rehearsal::rehearse;
 use crate::status::{DriverStatus, JointReading, Pins, StillRule};
 
 /// Confirmations that wait for their proposal; more are refused at once.
 const WAITING_CONFIRMATIONS: usize = 16;
+/// Calls of `home` that are answered when the arm is there; more fail at once.
+const WAITING_CALLS: usize = 16;
 /// Joints move less than this from one reading to the next while they stand still: the noise of
 /// encoders.
 const STILL_STEP_RAD: f64 = 1e-4;
@@ -62,10 +66,12 @@ pub async fn run(node: Node, parameters: SuctionExecutorParameters) -> anyhow::R
         status_max_age: Duration::from_secs_f64(parameters.driver.status_max_age_s),
     };
     let executor = Executor {
-        proposals: node.subscription("pick_place", Qos::Event)?,
+        proposals: node.subscription("pick_place", Qos::Latched)?,
         confirmations: node.subscription("step_confirmation", Qos::Event)?,
         heightmaps: node.subscription("heightmap", Qos::Latched)?,
         results: node.publisher("step_result", Qos::Event)?,
+        home: node.service_server("~/home")?,
+        home_calls: Vec::new(),
         gate: Gate::new(rules),
         automatic: !parameters.require_approval,
         waiting: VecDeque::new(),
@@ -150,16 +156,26 @@ struct Waiting {
     until: Instant,
 }
 
-/// A primitive under way.
+/// What moves the arm.
+#[derive(Clone, Copy, PartialEq, Eq)]
+enum Cause {
+    /// An approved proposal.
+    Proposal(u64),
+    /// A call of the service `home`.
+    Home,
+}
+
+/// A primitive, or the way home, under way.
 struct Motion {
-    id: u64,
+    cause: Cause,
     stop: CancellationToken,
     task: JoinHandle<Ended>,
 }
 
-/// How a primitive ended.
+/// How a motion ended.
 struct Ended {
-    result: Result<Outcome, ExecuteError<DriverError>>,
+    /// Nothing at home without a primitive.
+    result: Result<Option<Outcome>, ExecuteError<DriverError>>,
     /// Stamps of the first and the last joint reading.
     stamps: Option<(Duration, Duration)>,
 }
@@ -172,6 +188,9 @@ struct Executor {
     confirmations: Subscription<sctn_msgs::StepConfirmation>,
     heightmaps: Subscription<sctn_msgs::Heightmap>,
     results: Publisher<sctn_msgs::StepResult>,
+    home: ServiceServer<Trigger>,
+    /// Calls of `home` to be answered when the arm is there.
+    home_calls: Vec<RequestId>,
     gate: Gate,
     /// Whether new proposals move by themselves.
     automatic: bool,
@@ -192,7 +211,8 @@ impl Executor {
                 message = self.heightmaps.recv() => self.on_heightmap(message),
                 message = self.proposals.recv() => self.on_proposal(message),
                 message = self.confirmations.recv() => self.on_confirmation(message),
-                ended = end_of(&mut self.motion) => self.on_end(ended),
+                (call, _) = self.home.recv() => self.on_home(call),
+                (cause, stopped, ended) = end_of(&mut self.motion) => self.on_end(cause, stopped, ended),
                 () = sleep_until(deadline) => self.ask_again(),
                 _ = diagnostics.tick() => self.diagnose(),
                 () = node.shutdown() => break,
@@ -201,9 +221,10 @@ impl Executor {
         if let Some(motion) = &self.motion {
             warn!("shutting down while moving: stopping");
             motion.stop.cancel();
-            if let Ok(ended) = tokio::time::timeout(SHUTDOWN_GRACE, end_of(&mut self.motion)).await
+            if let Ok((cause, stopped, ended)) =
+                tokio::time::timeout(SHUTDOWN_GRACE, end_of(&mut self.motion)).await
             {
-                self.on_end(ended);
+                self.on_end(cause, stopped, ended);
             }
         }
         Ok(())
@@ -344,8 +365,6 @@ impl Executor {
 
     fn begin(&mut self, proposal: Proposal) {
         info!("proposal {}: moving", proposal.id);
-        let stop = CancellationToken::new();
-        let mut robot = DriverRobot::new(Arc::clone(&self.link), Handle::current(), stop.clone());
         let arm = self.work_cell.arm.clone();
         let diagnostics = self.node.diagnostics().clone();
         let id = proposal.id;
@@ -353,27 +372,82 @@ impl Executor {
             let values = [("proposal_id", id.to_string())];
             diagnostics.set("motion", Level::Ok, format!("{phase:?}"), values);
         };
-        let task = self.node.spawn_blocking(move || {
+        self.start(Cause::Proposal(id), move |robot| {
             let Proposal {
                 action, settings, ..
             } = &proposal;
-            let result = pick_place::execute(&mut robot, &arm, action, settings, observe);
-            Ended {
-                result,
-                stamps: robot.stamps,
-            }
+            pick_place::execute(robot, &arm, action, settings, observe).map(Some)
         });
-        self.motion = Some(Motion { id, stop, task });
     }
 
-    fn on_end(&mut self, (id, stopped, ended): (u64, bool, anyhow::Result<Ended>)) {
+    /// Brings the arm home, for after a stop or a fault. The call may come again because its
+    /// answer was lost.
+    fn on_home(&mut self, call: RequestId) {
+        let at_work = self
+            .motion
+            .as_ref()
+            .is_some_and(|motion| motion.cause == Cause::Home);
+        if !at_work {
+            if let Err(reason) = self
+                .gate
+                .go_home(&self.status.borrow(), self.origin.elapsed())
+            {
+                warn!("home: {reason}");
+                self.home.respond(
+                    call,
+                    TriggerResponse {
+                        success: false,
+                        message: reason,
+                    },
+                );
+                return;
+            }
+            info!("home: moving");
+            let arm = self.work_cell.arm.clone();
+            self.start(Cause::Home, move |robot| {
+                go_home(robot, &arm).map(|()| None)
+            });
+        }
+        if self.home_calls.len() < WAITING_CALLS {
+            self.home_calls.push(call);
+        } else {
+            let message = format!("{WAITING_CALLS} other calls wait");
+            self.home.respond(
+                call,
+                TriggerResponse {
+                    success: false,
+                    message,
+                },
+            );
+        }
+    }
+
+    /// Moves the arm on a thread of its own.
+    fn start(
+        &mut self,
+        cause: Cause,
+        work: impl FnOnce(&mut DriverRobot) -> Result<Option<Outcome>, ExecuteError<DriverError>>
+        + Send
+        + 'static,
+    ) {
+        let stop = CancellationToken::new();
+        let mut robot = DriverRobot::new(Arc::clone(&self.link), Handle::current(), stop.clone());
+        let task = self.node.spawn_blocking(move || Ended {
+            result: work(&mut robot),
+            stamps: robot.stamps,
+        });
+        self.motion = Some(Motion { cause, stop, task });
+    }
+
+    fn on_end(&mut self, cause: Cause, stopped: bool, ended: anyhow::Result<Ended>) {
         use sctn_msgs::StepResult;
         let (result, stamps) = match ended {
             Ok(ended) => (Ok(ended.result), ended.stamps),
             Err(error) => (Err(error), None),
         };
         let (outcome, mut reason) = match result {
-            Ok(Ok(outcome)) => (convert::outcome_to_msg(outcome), why(outcome).to_owned()),
+            Ok(Ok(Some(outcome))) => (convert::outcome_to_msg(outcome), why(outcome).to_owned()),
+            Ok(Ok(None)) => (StepResult::PLACED, "at home".to_owned()),
             Ok(Err(ExecuteError::Robot {
                 phase,
                 error: DriverError::Stopped,
@@ -385,12 +459,6 @@ impl Executor {
             Err(error) => (StepResult::FAULT, format!("{error:#}")),
         };
         let broken_off = matches!(outcome, StepResult::STOPPED | StepResult::FAULT);
-        let values = [("proposal_id", id.to_string())];
-        let level = if outcome == StepResult::FAULT {
-            Level::Error
-        } else {
-            Level::Ok
-        };
         if broken_off {
             // Nothing goes on by itself.
             self.automatic = false;
@@ -400,15 +468,30 @@ impl Executor {
                 .trim()
                 .to_owned();
         }
-        self.node
-            .diagnostics()
-            .set("motion", level, &reason, values);
+        let level = if outcome == StepResult::FAULT {
+            Level::Error
+        } else {
+            Level::Ok
+        };
+        self.node.diagnostics().set("motion", level, &reason, []);
         // Observations from then on show the result. Simulated time may still be on its way.
         let now = Duration::from_nanos(self.node.clock().now_ns().max(0) as u64);
         let end = stamps.map_or(now, |(_, last)| last.max(now));
         let duration = stamps.map_or(Duration::ZERO, |(first, last)| last - first.min(last));
         self.gate.finish(end);
-        self.report(id, outcome, reason, Some((end, duration)));
+        match cause {
+            Cause::Proposal(id) => self.report(id, outcome, reason, Some((end, duration))),
+            Cause::Home => {
+                info!("home: {reason}");
+                for call in std::mem::take(&mut self.home_calls) {
+                    let response = TriggerResponse {
+                        success: !broken_off,
+                        message: reason.clone(),
+                    };
+                    self.home.respond(call, response);
+                }
+            }
+        }
         self.ask_again();
     }
 
@@ -453,15 +536,14 @@ impl Executor {
 }
 
 /// Waits for the end of a motion, and takes it; for ever when there is none.
-async fn end_of(motion: &mut Option<Motion>) -> (u64, bool, anyhow::Result<Ended>) {
+async fn end_of(motion: &mut Option<Motion>) -> (Cause, bool, anyhow::Result<Ended>) {
     match motion {
         Some(running) => {
-            let ended = (&mut running.task)
-                .await
-                .context("the motion's thread panicked");
-            let (id, stopped) = (running.id, running.stop.is_cancelled());
+            let ended = (&mut running.task).await;
+            let ended = ended.context("the motion's thread panicked");
+            let (cause, stopped) = (running.cause, running.stop.is_cancelled());
             *motion = None;
-            (id, stopped, ended)
+            (cause, stopped, ended)
         }
         None => std::future::pending().await,
     }

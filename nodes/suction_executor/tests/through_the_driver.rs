@@ -12,11 +12,14 @@ use msgs::convert;
 use msgs::diagnostic_msgs::DiagnosticArray;
 use msgs::sctn_msgs::{self, Reward, StepConfirmation, StepResult};
 use msgs::sensor_msgs::{CameraInfo, Image, JointState};
+use msgs::std_srvs::{Trigger, TriggerRequest};
 use msgs::tf2_msgs::TFMessage;
 use msgs::ur_dashboard_msgs::SafetyMode;
 use multiravens::{Environment, Problem};
 use nalgebra::{Isometry2, Isometry3, Vector2};
-use node_kit::{Context, Network, Node, Parameters, Publisher, Qos, RosArguments, Subscription};
+use node_kit::{
+    CallOptions, Context, Network, Node, Parameters, Publisher, Qos, RosArguments, Subscription,
+};
 use pick_place::{PickPlace, PrimitiveSettings};
 use serde::{Deserialize, Serialize};
 use ur5::WorkCell;
@@ -106,7 +109,7 @@ impl Bench {
         };
         let bench = Self {
             heightmaps: node.publisher("heightmap", Qos::Latched).unwrap(),
-            proposals: node.publisher("pick_place", Qos::Event).unwrap(),
+            proposals: node.publisher("pick_place", Qos::Latched).unwrap(),
             confirmations: node.publisher("step_confirmation", Qos::Event).unwrap(),
             safety_mode: node
                 .publisher("io_and_status_controller/safety_mode", Qos::Latched)
@@ -454,6 +457,33 @@ async fn a_stop_stops_the_arm_and_it_goes_on_neither_by_itself_nor_on_the_old_ap
     );
     tokio::time::sleep(Duration::from_secs(1)).await;
     assert_eq!(bench.joints().await.position, stopped.position);
+    // Called home, it can see and be told again.
+    let home_service = bench
+        .node
+        .service_client::<Trigger>("/suction_executor/home")
+        .unwrap();
+    home_service.wait_for_server(PATIENCE).await.unwrap();
+    let patient = CallOptions {
+        attempts: 1,
+        timeout: PATIENCE,
+    };
+    let response = home_service
+        .call(&TriggerRequest::default(), &patient)
+        .await
+        .unwrap();
+    assert!(response.success, "{}", response.message);
+    let at_home = bench.joints().await;
+    assert_eq!(
+        convert::joints_from_msg(&at_home, &environment.cell().work_cell().joint_names).unwrap(),
+        home
+    );
+    let time = convert::time_from_msg(&at_home.header.stamp).unwrap();
+    let seen = bench.look(time).await;
+    bench.observe(&seen, time);
+    let action = reference().demonstrate().unwrap();
+    bench.propose(2, time, &action, &environment.settings().unwrap());
+    bench.decide(2, StepConfirmation::APPROVE);
+    bench.until_moving().await;
     bench.stop().await;
 }
 

@@ -10,6 +10,12 @@ pub const RED: [u8; 3] = [255, 87, 89];
 pub const BLUE: [u8; 3] = [78, 121, 167];
 /// Yellow.
 pub const YELLOW: [u8; 3] = [237, 201, 72];
+/// Green.
+pub const GREEN: [u8; 3] = [89, 161, 79];
+/// Orange.
+pub const ORANGE: [u8; 3] = [242, 142, 43];
+/// Purple.
+pub const PURPLE: [u8; 3] = [176, 122, 161];
 /// Grey: beads.
 pub const GREY: [u8; 3] = [186, 176, 172];
 /// Pegs.

@@ -3,6 +3,7 @@
 mod chaining;
 mod placing;
 mod routing;
+mod stacking;
 
 use crate::world::World;
 use nalgebra::{Isometry2, Isometry3, Vector2};
@@ -17,6 +18,7 @@ pub const REGISTRY: &[(&str, Configure)] = &[
     ("chaining", chaining::configure),
     ("placing", placing::configure),
     ("routing", routing::configure),
+    ("stacking", stacking::configure),
 ];
 
 /// Reads and checks the `parameters` of a module in a problem file.

@@ -3,12 +3,17 @@
 //! ros2-client's own `wait_for_*` depend on an event channel that all nodes of a participant share
 //! and take from each other, so we look at the discovered endpoints instead.
 
-use std::time::{Duration, Instant};
+use std::{
+    fmt,
+    time::{Duration, Instant},
+};
 
-use rustdds::{DomainParticipant, RTPSEntity};
+use rustdds::{DomainParticipant, GUID, QosPolicies, RTPSEntity};
 
-use crate::service::CallError;
+use crate::{service::CallError, statistics::Direction};
 
+/// The type with which ros2-client subscribes to `/clock`.
+const CLOCK_OF_ROS2_CLIENT: &str = "builtin_interfaces::msg::dds_::Time_";
 const POLL_PERIOD: Duration = Duration::from_millis(20);
 
 /// The ROS graph as one node has discovered it, without its own endpoints.
@@ -76,6 +81,40 @@ impl Graph {
             .ok_or_else(|| unavailable(name, limit))
     }
 
+    /// Which endpoints of other nodes cannot talk to these, which DDS passes over in silence.
+    pub(crate) fn conflicts(&self, endpoints: &[Endpoint]) -> Vec<Conflict> {
+        let own = self.participant.guid().prefix;
+        let mut conflicts = Vec::new();
+        for reader in self.participant.discovered_readers() {
+            let guid = reader.reader_proxy.remote_reader_guid;
+            let data = &reader.subscription_topic_data;
+            // Every node made with ros2-client has such a reader.
+            let known = data.topic_name() == "rt/clock" && data.type_name() == CLOCK_OF_ROS2_CLIENT;
+            let writers = endpoints
+                .iter()
+                .filter(|ours| ours.direction == Direction::Out && ours.is_on(data.topic_name()));
+            for ours in writers.filter(|_| guid.prefix != own && !known) {
+                conflicts.extend(ours.conflict(
+                    guid,
+                    data.type_name(),
+                    &ours.policies,
+                    &data.qos(),
+                ));
+            }
+        }
+        for writer in self.participant.discovered_writers() {
+            let guid = writer.writer_proxy.remote_writer_guid;
+            let data = &writer.publication_topic_data;
+            let readers = endpoints
+                .iter()
+                .filter(|ours| ours.direction == Direction::In && ours.is_on(&data.topic_name));
+            for ours in readers.filter(|_| guid.prefix != own) {
+                conflicts.extend(ours.conflict(guid, &data.type_name, &data.qos(), &ours.policies));
+            }
+        }
+        conflicts
+    }
+
     async fn wait(&self, limit: Duration, condition: impl Fn() -> bool) -> bool {
         let start = Instant::now();
         loop {
@@ -111,6 +150,67 @@ impl Graph {
                     && writer.writer_proxy.remote_writer_guid.prefix != own
             })
             .count()
+    }
+}
+
+/// A publisher or subscription of this node.
+#[derive(Clone, Debug)]
+pub(crate) struct Endpoint {
+    /// Absolute name of the topic.
+    pub topic: String,
+    pub direction: Direction,
+    /// As DDS names it.
+    pub type_name: String,
+    pub policies: QosPolicies,
+}
+
+/// An endpoint of this node and one of another that do not fit together.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub(crate) struct Conflict {
+    pub topic: String,
+    pub remote: GUID,
+    reason: String,
+}
+
+impl fmt::Display for Conflict {
+    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(formatter, "{}: {}", self.topic, self.reason)
+    }
+}
+
+impl Endpoint {
+    fn is_on(&self, dds_topic: &str) -> bool {
+        dds_topic.strip_prefix("rt") == Some(self.topic.as_str())
+    }
+
+    fn conflict(
+        &self,
+        remote: GUID,
+        type_name: &str,
+        offered: &QosPolicies,
+        requested: &QosPolicies,
+    ) -> Option<Conflict> {
+        let (ours, other) = match self.direction {
+            Direction::In => ("subscription", "publisher"),
+            Direction::Out => ("publisher", "subscription"),
+        };
+        let reason = if type_name != self.type_name {
+            format!(
+                "this {ours} has type {}, a {other} of another node ({remote:?}) has {type_name}",
+                self.type_name
+            )
+        } else {
+            let policy = offered.compliance_failure_wrt(requested)?;
+            format!(
+                "no messages between this {ours} and a {other} of another node ({remote:?}): the \
+                 {policy:?} offered is less than the one requested"
+            )
+        };
+        Some(Conflict {
+            topic: self.topic.clone(),
+            remote,
+            reason,
+        })
     }
 }
 

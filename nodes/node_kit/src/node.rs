@@ -19,14 +19,14 @@ use ros2_client::{
 use rustdds::{Topic, TopicKind};
 use tokio::task::JoinHandle;
 use tokio_util::sync::CancellationToken;
-use tracing::{Instrument, error};
+use tracing::{Instrument, error, warn};
 
 use crate::{
     action::{ActionClient, ActionServer},
     arguments::RosArguments,
     clock::Clock,
-    diagnostics::{self, Diagnostics},
-    graph::Graph,
+    diagnostics::{self, Diagnostics, Level},
+    graph::{Conflict, Endpoint, Graph},
     logging,
     qos::Qos,
     service::{ServiceClient, ServiceServer},
@@ -86,10 +86,36 @@ struct Inner {
     full_name: String,
     clock: Clock,
     statistics: Mutex<Vec<Arc<Statistics>>>,
+    endpoints: Mutex<Vec<Endpoint>>,
     diagnostics: Diagnostics,
     span: tracing::Span,
     shutdown: CancellationToken,
     shutdown_observed: AtomicBool,
+}
+
+impl Inner {
+    /// Endpoints of other nodes that cannot talk to ours: a warning once, a state while they last.
+    fn report_conflicts(&self, graph: &Graph, known: &mut Vec<Conflict>) {
+        let endpoints = self
+            .endpoints
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner)
+            .clone();
+        let conflicts = graph.conflicts(&endpoints);
+        for conflict in conflicts.iter().filter(|now| !known.contains(now)) {
+            warn!("{conflict}");
+        }
+        match conflicts.first() {
+            Some(first) => self.diagnostics.set(
+                "graph",
+                Level::Error,
+                first.to_string(),
+                [("conflicts", conflicts.len().to_string())],
+            ),
+            None => self.diagnostics.clear("graph"),
+        }
+        *known = conflicts;
+    }
 }
 
 impl Drop for Inner {
@@ -136,6 +162,7 @@ impl Node {
                 full_name,
                 clock,
                 statistics: Mutex::default(),
+                endpoints: Mutex::default(),
                 diagnostics: Diagnostics::default(),
                 span,
                 shutdown,
@@ -392,17 +419,28 @@ impl Node {
         direction: Direction,
     ) -> Result<(String, Topic), NodeError> {
         let (full, _) = self.ros_name("topic", name)?;
+        let endpoint = Endpoint {
+            topic: full.clone(),
+            direction,
+            type_name: message_type_name::<M>().dds_msg_type(),
+            policies: qos.policies(direction),
+        };
         let topic = self
             .inner
             .context
             .domain_participant()
             .create_topic(
                 format!("rt{full}"),
-                message_type_name::<M>().dds_msg_type(),
-                &qos.policies(direction),
+                endpoint.type_name.clone(),
+                &endpoint.policies,
                 TopicKind::NoKey,
             )
             .map_err(|error| NodeError::middleware("topic", &full, format!("{error:?}")))?;
+        let endpoints = &self.inner.endpoints;
+        endpoints
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner)
+            .push(endpoint);
         Ok((full, topic))
     }
 
@@ -427,8 +465,10 @@ impl Node {
         let publisher = self.publisher::<DiagnosticArray>("/diagnostics", Qos::Event)?;
         // Weak, or the task would keep the node alive.
         let weak = Arc::downgrade(&self.inner);
+        let graph = self.graph();
         self.spawn_background(async move {
             let mut previous = Vec::new();
+            let mut known = Vec::new();
             let mut ticks = tokio::time::interval(diagnostics::PERIOD);
             ticks.set_missed_tick_behavior(tokio::time::MissedTickBehavior::Delay);
             loop {
@@ -441,6 +481,7 @@ impl Node {
                     .lock()
                     .unwrap_or_else(PoisonError::into_inner)
                     .clone();
+                node.report_conflicts(&graph, &mut known);
                 publisher.publish(node.diagnostics.report(
                     &node.full_name,
                     node.clock.now(),

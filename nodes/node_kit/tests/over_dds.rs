@@ -313,6 +313,33 @@ async fn logs_reach_rosout_and_diagnostics_name_the_topics() {
     speaking.abort();
 }
 
+#[tokio::test(flavor = "multi_thread")]
+async fn endpoints_that_cannot_talk_are_named_in_diagnostics() {
+    let context = context(49);
+    let sender = node(&context, "sender", "");
+    let receiver = node(&context, "receiver", "");
+    let _best_effort = sender.publisher::<Header>("x", Qos::Image).unwrap();
+    let _reliable = receiver.subscription::<Header>("x", Qos::Event).unwrap();
+    let _volatile = sender.publisher::<Header>("y", Qos::Event).unwrap();
+    let _latched = receiver.subscription::<Header>("y", Qos::Latched).unwrap();
+    let _image = sender.publisher::<Image>("z", Qos::Event).unwrap();
+    let _header = receiver.subscription::<Header>("z", Qos::Event).unwrap();
+    let mut diagnostics = sender
+        .subscription::<DiagnosticArray>("/diagnostics", Qos::Event)
+        .unwrap();
+    timeout(LIMIT, async {
+        loop {
+            let array = diagnostics.recv().await;
+            let graph = array.status.iter().find(|s| s.name == "/receiver: graph");
+            if graph.is_some_and(|s| s.level == 2 && s.values[0].value == "3") {
+                break;
+            }
+        }
+    })
+    .await
+    .expect("three conflicts");
+}
+
 /// rcl_interfaces/Log, which is not among our packages.
 #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
 struct RosoutLog {

@@ -37,7 +37,7 @@ pub async fn run(node: Node, parameters: GctnPolicyParameters) -> anyhow::Result
     // Before the network, which takes its time to load: nobody shall be missed meanwhile.
     let outputs = Outputs {
         node: node.clone(),
-        proposals: node.publisher("pick_place", Qos::Event)?,
+        proposals: node.publisher("pick_place", Qos::Latched)?,
         markers: node.publisher("pick_place/markers", Qos::Latched)?,
         scores: node.publisher("pick_place/scores", Qos::Latched)?,
     };
@@ -57,7 +57,7 @@ pub async fn run(node: Node, parameters: GctnPolicyParameters) -> anyhow::Result
         })
         .await
         .context("loading the checkpoint")?
-        .with_context(|| format!("parameter checkpoint: {shown}"))?;
+        .context("parameter checkpoint")?;
     info!("checkpoint {shown} loaded");
 
     // One job at a time: the proposer gives the next when it has the answer.

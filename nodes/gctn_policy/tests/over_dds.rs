@@ -105,7 +105,7 @@ async fn proposals_follow_goals_rejections_and_changed_scenes() {
         .publisher::<StepResult>("step_result", Qos::Event)
         .unwrap();
     let mut proposals = node
-        .subscription::<PickPlace>("pick_place", Qos::Event)
+        .subscription::<PickPlace>("pick_place", Qos::Latched)
         .unwrap();
     let mut scores = node
         .subscription::<Image>("pick_place/scores", Qos::Latched)

@@ -32,7 +32,7 @@ pub async fn run(node: Node, parameters: GoalOracleParameters) -> anyhow::Result
 
     let goal = node.publisher::<Goal>("goal", Qos::Latched)?;
     let refusals = node.publisher::<StepResult>("step_result", Qos::Event)?;
-    let mut proposals = node.subscription::<PickPlace>("pick_place", Qos::Event)?;
+    let mut proposals = node.subscription::<PickPlace>("pick_place", Qos::Latched)?;
     let mut results = node.subscription::<StepResult>("step_result", Qos::Event)?;
     let mut confirmations =
         node.subscription::<StepConfirmation>("step_confirmation", Qos::Event)?;

@@ -102,7 +102,7 @@ async fn results_and_confirmations_walk_through_a_demonstration() {
         .node::<NoParameters>("others", &RosArguments::default())
         .unwrap();
     let proposals = node
-        .publisher::<PickPlace>("pick_place", Qos::Event)
+        .publisher::<PickPlace>("pick_place", Qos::Latched)
         .unwrap();
     let results = node
         .publisher::<StepResult>("step_result", Qos::Event)

@@ -30,7 +30,7 @@ STREAM = QoSProfile(depth=5, history=HistoryPolicy.KEEP_LAST, reliability=Reliab
 TOPICS = {
     "heightmap": (Heightmap, LATCHED),
     "goal": (Goal, LATCHED),
-    "pick_place": (PickPlace, EVENT),
+    "pick_place": (PickPlace, LATCHED),
     "step_result": (StepResult, EVENT),
     "reward": (Reward, EVENT),
     "joint_states": (JointState, STREAM),
@@ -53,7 +53,6 @@ class Operator:
         for topic, (message_type, qos) in TOPICS.items():
             self.node.create_subscription(message_type, topic, self.received[topic].append, qos)
         self._confirmations = self.node.create_publisher(StepConfirmation, "step_confirmation", EVENT)
-        # No joint state is lost sight of: only the newest of the stream is needed.
 
     def __enter__(self) -> Operator:
         return self

@@ -35,7 +35,7 @@ def run(start, directory: pathlib.Path) -> dict[str, list[bytes]]:
     outcome = json.loads(launch.output().splitlines()[-1])
     assert outcome["completed"] is True, outcome
     messages: dict[str, list[bytes]] = {topic: [] for topic in COMPARED}
-    (file,) = directory.rglob("*.mcap")
+    (file,) = pathlib.Path(outcome["bag"]).glob("*.mcap")
     with file.open("rb") as stream:
         for _, channel, message in make_reader(stream).iter_messages():
             known = messages.get(channel.topic)

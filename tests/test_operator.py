@@ -14,17 +14,24 @@ DISKS = 9
 MOST_PROPOSALS = 3 * DISKS
 
 
-def test_an_operator_in_python_sees_the_graph_and_places_all_nine_disks(start, operator: Operator) -> None:
+def test_an_operator_in_python_sees_the_graph_and_places_all_nine_disks(start, operator: Operator, domain: int) -> None:
     launch = start("sctn", "launch", "--problem", "placing", "--seed", 10000, "--operator", "none", "--processes")
 
-    operator.until(lambda: NODES <= {name for name, _ in operator.node.get_node_names_and_namespaces()}, "full graph", 60.0)
-    check_heightmap(operator.next("heightmap"))
+    heightmap = operator.next("heightmap")
+    check_heightmap(heightmap)
+    assert (heightmap.views, heightmap.header.frame_id) == (3, "world")
+    assert heightmap.coverage > 0.95
     goal = operator.next("goal")
     assert (goal.problem, goal.step, goal.step_count, goal.attempt, goal.complete) == ("placing", 1, DISKS, 0, False)
     check_heightmap(goal.heightmap)
 
     # The first proposal is rejected: nothing moves, and another one is made.
     first = next_proposal(operator, goal)
+    with Operator(domain, "onlooker") as onlooker:
+        names = onlooker.node.get_node_names_and_namespaces
+        onlooker.until(lambda: NODES <= {name for name, _ in names()}, f"graph of {NODES}", 20.0)
+        # A proposal is latched: who comes later sees it too.
+        assert onlooker.next("pick_place") == first
     rejected = operator.count("step_result")
     operator.confirm(first.id, StepConfirmation.REJECT)
     result = operator.next("step_result", rejected)
@@ -72,13 +79,11 @@ def test_a_late_joiner_gets_the_latched_heightmap_and_goal(start, operator: Oper
 
 
 def check_heightmap(heightmap: Heightmap) -> None:
-    """Sizes agree with each other and the workspace was seen."""
+    """Sizes agree with each other, heights are those of disks."""
     cells = heightmap.rows * heightmap.cols
     assert (heightmap.rows, heightmap.cols) == (320, 160)
     assert len(heightmap.rgb) == 3 * cells
     assert len(heightmap.height_m) == cells
-    assert heightmap.header.frame_id == "world"
-    assert heightmap.coverage > 0.95
     assert np.isfinite(heights(heightmap)).all()
     assert 0.002 < heights(heightmap).max() < 0.3
 

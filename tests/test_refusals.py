@@ -18,7 +18,7 @@ from rclpy.publisher import Publisher
 from sctn_msgs.msg import Heightmap, PickPlace, PrimitiveSettings, StepConfirmation, StepResult
 from std_msgs.msg import Header
 
-from cell_operator import EVENT, LATCHED, Operator
+from cell_operator import LATCHED, Operator
 
 ROWS, COLS, PIXEL_SIZE_M = 320, 160, 0.003125
 SETTINGS = PrimitiveSettings(
@@ -37,7 +37,7 @@ class Cell:
     def __init__(self, operator: Operator) -> None:
         self.operator = operator
         self._heightmaps = operator.node.create_publisher(Heightmap, "heightmap", LATCHED)
-        self._proposals = operator.node.create_publisher(PickPlace, "pick_place", EVENT)
+        self._proposals = operator.node.create_publisher(PickPlace, "pick_place", LATCHED)
         self._id = 0
 
     def wait_until_ready(self) -> None:

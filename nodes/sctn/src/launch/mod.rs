@@ -13,7 +13,9 @@ use heightmap::Heightmap;
 use msgs::convert::heightmap_from_msg;
 use msgs::sctn_msgs::{Goal, PickPlace, Reward, StepConfirmation, StepResult};
 use multiravens::Environment;
-use node_kit::{Context, Network, Node, Parameters, Qos, RosArguments, wait_for_end};
+use node_kit::{
+    Context, Network, Node, Parameters, Qos, RosArguments, ns_from_stamp, wait_for_end,
+};
 use operator::{Operator, OperatorKind, Question, automatic, outcome_name};
 use recorder::Recorder;
 use serde::{Deserialize, Serialize};
@@ -208,6 +210,8 @@ struct Desk {
     refusals: u32,
     steps: usize,
     total_reward: f64,
+    /// Stamp of the last reward.
+    measured_ns: i64,
     complete: bool,
     last_heightmap: Option<msgs::sctn_msgs::Heightmap>,
 }
@@ -216,7 +220,7 @@ impl Desk {
     fn new(node: &Node) -> Result<Self> {
         Ok(Self {
             node: node.clone(),
-            proposals: node.subscription("pick_place", Qos::Event)?,
+            proposals: node.subscription("pick_place", Qos::Latched)?,
             results: node.subscription("step_result", Qos::Event)?,
             rewards: node.subscription("reward", Qos::Event)?,
             goals: node.subscription("goal", Qos::Latched)?,
@@ -228,6 +232,7 @@ impl Desk {
             refusals: 0,
             steps: 0,
             total_reward: 0.0,
+            measured_ns: 0,
             complete: false,
             last_heightmap: None,
         })
@@ -249,6 +254,7 @@ impl Desk {
                 result = self.results.recv() => self.result(result)?,
                 reward = self.rewards.recv() => {
                     self.total_reward = reward.total;
+                    self.measured_ns = ns_from_stamp(&reward.header.stamp);
                     self.operator.reward(reward)
                 }
                 goal = self.goals.recv() => {
@@ -350,12 +356,19 @@ impl Desk {
         );
     }
 
-    /// The reward of the last step comes before its heightmap.
+    /// Reward and heightmap of the last step come in any order.
     async fn wait_for_last_heightmap(&mut self) {
-        if let Ok(heightmap) =
-            tokio::time::timeout(Duration::from_secs(2), self.heightmaps.recv()).await
-        {
-            self.last_heightmap = Some(heightmap);
+        let seen = |message: &Option<msgs::sctn_msgs::Heightmap>| {
+            message
+                .as_ref()
+                .map(|message| ns_from_stamp(&message.header.stamp))
+        };
+        while seen(&self.last_heightmap) < Some(self.measured_ns) {
+            let next = tokio::time::timeout(Duration::from_secs(2), self.heightmaps.recv()).await;
+            match next {
+                Ok(heightmap) => self.last_heightmap = Some(heightmap),
+                Err(_) => return tracing::warn!("no heightmap came after the last step"),
+            }
         }
     }
 }

@@ -42,7 +42,7 @@ impl Recorder {
         };
         topics.record::<Heightmap>("heightmap", Qos::Latched, false)?;
         topics.record::<Goal>("goal", Qos::Latched, false)?;
-        topics.record::<PickPlace>("pick_place", Qos::Event, false)?;
+        topics.record::<PickPlace>("pick_place", Qos::Latched, false)?;
         topics.record::<StepConfirmation>("step_confirmation", Qos::Event, false)?;
         // A step's result is the moment after which a crash must lose nothing of the step.
         topics.record::<StepResult>("step_result", Qos::Event, true)?;

@@ -88,11 +88,12 @@ impl Default for Parameters {
 /// Reads the module's parameters.
 pub(super) fn configure(parameters: Value) -> Result<Box<dyn TaskModule>, ParameterError> {
     let parameters: Parameters = read_parameters(parameters)?;
+    // Within these a chain has 31 to 37 beads and all keeps to the footprint.
     for distance in parameters.distances_m {
-        check_range("distances_m", distance, 0.1, 0.15)?;
+        check_range("distances_m", distance, 0.11, 0.14)?;
     }
     for radius in parameters.radii_m {
-        check_range("radii_m", radius, 0.012, 0.025)?;
+        check_range("radii_m", radius, 0.015, 0.02)?;
     }
     check_range("turn_rad", parameters.turn_rad, 0.0, FRAC_PI_4)?;
     check_range("tolerance_m", parameters.tolerance_m, 5e-3, 0.03)?;

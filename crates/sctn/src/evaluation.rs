@@ -57,7 +57,7 @@ pub enum EvaluationError {
         /// Seed of the episode.
         seed: u64,
         /// Why.
-        source: EnvironmentError,
+        source: Box<EnvironmentError>,
     },
     /// The policy failed.
     #[error("seed {seed}: {source}")]
@@ -93,7 +93,10 @@ pub fn attempt(
     policy: &Policy,
     seed: u64,
 ) -> Result<Option<Rollout>, EvaluationError> {
-    let failed = |source| EvaluationError::Environment { seed, source };
+    let failed = |error| EvaluationError::Environment {
+        seed,
+        source: Box::new(error),
+    };
     let shown = demonstrate(environment, seed).map_err(failed)?;
     if !shown.complete {
         return Ok(None);
@@ -119,7 +122,10 @@ pub fn attempt(
         },
     );
     rollout.map(Some).map_err(|error| match error {
-        StepError::Environment(source) => EvaluationError::Environment { seed, source },
+        StepError::Environment(source) => EvaluationError::Environment {
+            seed,
+            source: Box::new(source),
+        },
         StepError::Policy(source) => EvaluationError::Policy { seed, source },
     })
 }

@@ -1,5 +1,6 @@
 //! `sctn demos`.
 
+use crate::gallery;
 use crate::progress;
 use crate::root::Root;
 use anyhow::{Context, Result, bail};
@@ -18,14 +19,18 @@ use ur5::WorkCell;
 #[derive(Args)]
 pub struct Demos {
     /// Problem to demonstrate
-    #[arg(long)]
-    problem: String,
+    #[arg(long, required_unless_present = "gallery")]
+    problem: Option<String>,
     /// Episodes to try; the successful ones are kept
-    #[arg(long)]
-    episodes: u64,
+    #[arg(long, required_unless_present = "gallery")]
+    episodes: Option<u64>,
     /// Seed of the first episode; the next ones are seed + 2, seed + 4, ... (training even, validation odd)
-    #[arg(long)]
-    seed: u64,
+    #[arg(long, required_unless_present = "gallery")]
+    seed: Option<u64>,
+    /// Draw instead, into this folder: the problem [default: all], its demonstration of the seed
+    /// [default: 0] as pictures and an animation
+    #[arg(long, conflicts_with_all = ["episodes", "out", "threads", "json"])]
+    gallery: Option<PathBuf>,
     /// Folder for the bags, DIR/PROBLEM/SEED each; those already there are kept [default: none are written]
     #[arg(long)]
     out: Option<PathBuf>,
@@ -62,11 +67,18 @@ struct Episode {
 
 impl Demos {
     pub fn run(self, root: &Root) -> Result<()> {
-        let problem = root.problem(&self.problem)?;
+        if let Some(folder) = &self.gallery {
+            let seed = self.seed.unwrap_or(0);
+            return gallery::draw(root, self.problem.as_deref(), seed, folder);
+        }
+        let name = self.problem.as_deref().context("--problem is missing")?;
+        let count = self.episodes.context("--episodes is missing")?;
+        let first_seed = self.seed.context("--seed is missing")?;
+        let problem = root.problem(name)?;
         let work_cell = root.work_cell()?;
         let cores = std::thread::available_parallelism().map_or(1, |cores| cores.get());
         let threads = self.threads.unwrap_or(cores).max(1);
-        let bar = progress::bar(self.episodes, "demonstrations");
+        let bar = progress::bar(count, "demonstrations");
         let started = ProcessTime::now();
         let next = AtomicU64::new(0);
         let stop = AtomicBool::new(false);
@@ -75,10 +87,10 @@ impl Demos {
             let mut environment = Environment::new(&problem, &work_cell);
             while !stop.load(Ordering::Relaxed) {
                 let index = next.fetch_add(1, Ordering::Relaxed);
-                if index >= self.episodes {
+                if index >= count {
                     break;
                 }
-                let seed = self.seed + 2 * index;
+                let seed = first_seed + 2 * index;
                 let episode = self
                     .episode(&mut environment, seed)
                     .inspect_err(|_| stop.store(true, Ordering::Relaxed))?;
@@ -107,8 +119,8 @@ impl Demos {
         let successes = kept.clone().count();
         let report = Report {
             problem: problem.name().to_owned(),
-            episodes: self.episodes,
-            success: successes as f64 / self.episodes.max(1) as f64,
+            episodes: count,
+            success: successes as f64 / count.max(1) as f64,
             interval_95: wilson_95(successes, episodes.len()),
             steps: kept.clone().map(|episode| episode.steps).sum(),
             bytes: kept.map(|episode| episode.bytes).sum(),
@@ -126,7 +138,7 @@ impl Demos {
                 report.cpu_seconds
             );
         }
-        if successes == 0 && self.episodes > 0 {
+        if successes == 0 && count > 0 {
             bail!("no demonstration of {} succeeded", report.problem);
         }
         Ok(())
@@ -134,10 +146,11 @@ impl Demos {
 
     /// Makes the demonstration of a seed, or takes the one that an earlier run has finished.
     fn episode(&self, environment: &mut Environment, seed: u64) -> Result<Episode> {
+        let problem = environment.problem().name().to_owned();
         let path = self
             .out
             .as_ref()
-            .map(|out| demonstration_path(out, &self.problem, seed));
+            .map(|out| demonstration_path(out, &problem, seed));
         if let Some(path) = &path
             && path.exists()
         {
@@ -149,8 +162,8 @@ impl Demos {
                 bytes: size(path)?,
             });
         }
-        let rollout = demonstrate(environment, seed)
-            .with_context(|| format!("{}, seed {seed}", self.problem))?;
+        let rollout =
+            demonstrate(environment, seed).with_context(|| format!("{problem}, seed {seed}"))?;
         let mut bytes = 0;
         if rollout.complete
             && let Some(path) = &path

@@ -3,6 +3,7 @@
 mod bench;
 mod demos;
 mod evaluate;
+mod gallery;
 mod launch;
 mod picture;
 mod progress;

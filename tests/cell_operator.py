@@ -44,6 +44,8 @@ class Operator:
     """Subscribes to all topics of a run on one domain; a context manager."""
 
     def __init__(self, domain: int, name: str = "operator") -> None:
+        # How many nodes have to hear a confirmation; more where the whole graph runs.
+        self.listeners = 1
         self.received: dict[str, list[Any]] = {topic: [] for topic in TOPICS}
         self._context = rclpy.Context()
         self._context.init(domain_id=domain)
@@ -112,7 +114,9 @@ class Operator:
     def _confirm_when_heard(self) -> None:
         # A volatile message to nobody is lost.
         self.until(
-            lambda: self._confirmations.get_subscription_count() > 0, "subscription to step_confirmation", timeout_s=30.0
+            lambda: self._confirmations.get_subscription_count() >= self.listeners,
+            "subscription to step_confirmation",
+            timeout_s=30.0,
         )
 
 

@@ -21,7 +21,7 @@ def test_the_operator_script_of_the_readme_carries_a_run_through(start, domain: 
         )
         try:
             launch = start("sctn", "launch", "--problem", "placing", "--seed", 10004, "--operator", "none", "--processes")
-            assert launch.wait(200.0) == 0, f"{launch.log()}\n{log.read_text()}"
+            assert launch.wait(100.0) == 0, f"{launch.log()}\n{log.read_text()}"
         finally:
             person.kill()
             person.wait()

@@ -51,6 +51,14 @@ pub struct Evaluation {
 /// Why an evaluation stopped.
 #[derive(Debug, thiserror::Error)]
 pub enum EvaluationError {
+    /// The demonstrator fails on nearly every seed, so that there is next to nothing to evaluate on.
+    #[error("the demonstrator of {problem} failed on most of the first {seeds} seeds")]
+    NoDemonstrations {
+        /// Name of the problem.
+        problem: String,
+        /// Seeds tried.
+        seeds: u64,
+    },
     /// The simulation failed.
     #[error("seed {seed}: {source}")]
     Environment {
@@ -68,6 +76,9 @@ pub enum EvaluationError {
         source: gctn::Error,
     },
 }
+
+/// A demonstrator that needs more seeds than this for each episode is broken.
+const MAX_SEEDS_PER_EPISODE: u64 = 10;
 
 enum StepError {
     Environment(EnvironmentError),
@@ -161,7 +172,15 @@ pub fn evaluate(
             if done >= episodes {
                 return Ok(());
             }
-            let seed = first_seed + 2 * next.fetch_add(1, Ordering::Relaxed);
+            let index = next.fetch_add(1, Ordering::Relaxed);
+            if index > MAX_SEEDS_PER_EPISODE * (episodes as u64 + 1) {
+                let problem = problem.name().to_owned();
+                return Err(EvaluationError::NoDemonstrations {
+                    problem,
+                    seeds: index,
+                });
+            }
+            let seed = first_seed + 2 * index;
             let report = attempt(&mut environment, &policy, seed)?.map(|rollout| EpisodeReport {
                 seed,
                 completed: rollout.complete,

@@ -164,3 +164,42 @@ impl Recipe {
         (1..=snapshots).map(move |index| index * steps / snapshots)
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn shipped() -> PathBuf {
+        Path::new(env!("CARGO_MANIFEST_DIR")).join("../../config/recipes/placing.yaml")
+    }
+
+    fn changed(from: &str, to: &str) -> String {
+        let text = std::fs::read_to_string(shipped()).unwrap();
+        assert!(text.contains(from), "{from}");
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("recipe.yaml");
+        std::fs::write(&path, text.replacen(from, to, 1)).unwrap();
+        let error = Recipe::load(&path).unwrap_err().to_string();
+        assert!(error.contains("recipe.yaml"), "{error}");
+        error
+    }
+
+    #[test]
+    fn the_shipped_recipe_loads_and_snapshots_end_with_the_last_step() {
+        let recipe = Recipe::load(&shipped()).unwrap();
+        let steps: Vec<_> = recipe.snapshot_steps().collect();
+        assert_eq!(steps.len() as u64, recipe.snapshots);
+        assert_eq!(steps.last(), Some(&recipe.training.steps));
+    }
+
+    #[test]
+    fn a_field_that_is_unknown_or_out_of_range_is_refused_by_name() {
+        assert!(changed("snapshots:", "snapshot:").contains("snapshot"));
+        assert!(changed("seed: 1}", "seed: 2}").contains("validation.seed is 2"));
+        assert!(changed("snapshots: 4", "snapshots: 0").contains("snapshots is 0"));
+        assert!(changed("batch: 4", "batch: 0").contains("batch is 0"));
+        assert!(
+            changed("demonstrations: 100", "demonstrations: 0").contains("demonstrations is 0")
+        );
+    }
+}

@@ -1,35 +1,21 @@
 //! Episodes of the problem *chaining*.
 
+mod episode;
+
+use episode::demonstration;
+use multiravens::Environment;
 use multiravens::world::Shape;
-use multiravens::{Environment, Problem};
 use nalgebra::{Isometry2, Vector2};
 use pick_place::PickPlace;
 use rand::{RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
-use std::path::Path;
-use ur5::WorkCell;
 
 fn environment() -> Environment {
-    let problems = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../config/problems");
-    let problem = Problem::load(&problems, "chaining").unwrap();
-    Environment::new(&problem, &WorkCell::builtin().unwrap())
+    episode::environment("chaining")
 }
 
 fn at(x: f64, y: f64) -> Isometry2<f64> {
     Isometry2::new(Vector2::new(x, y), 0.0)
-}
-
-/// FNV-1a over colours and height bits.
-fn heightmap_hash(environment: &mut Environment) -> u64 {
-    let heightmap = environment.observe().unwrap();
-    let heights = heightmap
-        .height_m
-        .iter()
-        .flat_map(|z| z.to_bits().to_le_bytes());
-    let bytes = heightmap.rgb.iter().copied().chain(heights);
-    bytes.fold(0xcbf2_9ce4_8422_2325, |hash, byte| {
-        (hash ^ u64::from(byte)).wrapping_mul(0x0000_0100_0000_01b3)
-    })
 }
 
 #[test]
@@ -119,13 +105,7 @@ const GOLDEN: [(u64, [u64; 3]); 2] = [
 fn a_seed_gives_the_same_bits_on_any_thread() {
     let play = |seed| {
         let mut environment = environment();
-        environment.reset(seed).unwrap();
-        let start = heightmap_hash(&mut environment);
-        while let (false, Some(action)) = (environment.is_done(), environment.demonstrate()) {
-            environment.step(&action).unwrap();
-        }
-        let goal = heightmap_hash(&mut environment);
-        (seed, [start, goal, environment.state_hash()])
+        (seed, demonstration(&mut environment, seed))
     };
     let here = GOLDEN.map(|(seed, _)| play(seed));
     assert_eq!(here, GOLDEN, "{here:#x?}");

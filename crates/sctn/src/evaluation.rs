@@ -147,7 +147,7 @@ pub fn attempt(
 pub fn evaluate(
     problem: &Problem,
     work_cell: &WorkCell,
-    policies: &[Mutex<Policy>],
+    policies: &mut [Policy],
     first_seed: u64,
     episodes: usize,
     progress: impl Fn(&EpisodeReport) + Sync,
@@ -157,10 +157,7 @@ pub fn evaluate(
     let outcomes = Mutex::new(Vec::new());
     // Seeds are handed out in order, and more of them while some are passed over; what comes after the
     // last needed episode is cut off below, so that the number of threads does not matter.
-    let work = |policy: &Mutex<Policy>| -> Result<(), EvaluationError> {
-        let policy = policy
-            .lock()
-            .unwrap_or_else(|poisoned| poisoned.into_inner());
+    let work = |policy: &mut Policy| -> Result<(), EvaluationError> {
         let mut environment = Environment::new(problem, work_cell);
         loop {
             let done = outcomes
@@ -181,7 +178,7 @@ pub fn evaluate(
                 });
             }
             let seed = first_seed + 2 * index;
-            let report = attempt(&mut environment, &policy, seed)?.map(|rollout| EpisodeReport {
+            let report = attempt(&mut environment, policy, seed)?.map(|rollout| EpisodeReport {
                 seed,
                 completed: rollout.complete,
                 reward: rollout.total_reward,
@@ -198,7 +195,7 @@ pub fn evaluate(
     };
     std::thread::scope(|scope| {
         let threads: Vec<_> = policies
-            .iter()
+            .iter_mut()
             .map(|policy| scope.spawn(|| work(policy)))
             .collect();
         threads
@@ -223,12 +220,7 @@ pub fn evaluate(
     }
     let completed = reports.iter().filter(|report| report.completed).count();
     let count = reports.len().max(1) as f64;
-    let conditioning = policies.first().map(|policy| {
-        let policy = policy
-            .lock()
-            .unwrap_or_else(|poisoned| poisoned.into_inner());
-        policy.config().conditioning
-    });
+    let conditioning = policies.first().map(|policy| policy.config().conditioning);
     Ok(Evaluation {
         problem: problem.name().to_owned(),
         agent: if conditioning == Some(GoalConditioning::Final) {

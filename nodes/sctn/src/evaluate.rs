@@ -7,7 +7,6 @@ use clap::Args;
 use gctn::Policy;
 use sctn::{Evaluation, evaluate};
 use std::path::PathBuf;
-use std::sync::Mutex;
 
 /// Arguments of `sctn evaluate`.
 #[derive(Args)]
@@ -43,14 +42,14 @@ impl Evaluate {
         let cores = std::thread::available_parallelism().map_or(1, |cores| cores.get());
         // One decision on one thread, several episodes at a time: the same bits whatever the machine.
         gctn::set_threads(1);
-        let policies = (0..self.threads.unwrap_or(cores).max(1))
-            .map(|_| Ok(Mutex::new(Policy::load(&checkpoint)?)));
-        let policies: Vec<_> = policies.collect::<Result<_>>()?;
+        let mut policies: Vec<_> = (0..self.threads.unwrap_or(cores).max(1))
+            .map(|_| Ok(Policy::load(&checkpoint)?))
+            .collect::<Result<_>>()?;
         let bar = progress::bar(self.episodes as u64, "episodes");
         let report = evaluate(
             &problem,
             &work_cell,
-            &policies,
+            &mut policies,
             self.seed,
             self.episodes,
             |_| bar.inc(1),

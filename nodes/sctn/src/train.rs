@@ -11,7 +11,6 @@ use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::io::Write;
 use std::path::{Path, PathBuf};
-use std::sync::Mutex;
 
 /// Gradient steps between lines of progress where there is no terminal.
 const LOG_EVERY: u64 = 50;
@@ -154,15 +153,15 @@ fn validate(root: &Root, recipe: &Recipe, snapshot: &mut Snapshot) -> Result<()>
         return Ok(());
     }
     let work_cell = root.work_cell()?;
-    let policies: Vec<_> = (0..recipe.training.threads.max(1))
-        .map(|_| Ok(Mutex::new(Policy::load(&snapshot.checkpoint)?)))
+    let mut policies: Vec<_> = (0..recipe.training.threads.max(1))
+        .map(|_| Ok(Policy::load(&snapshot.checkpoint)?))
         .collect::<Result<_>>()?;
     for name in &recipe.problems {
         let problem = root.problem(name)?;
         let report = evaluate(
             &problem,
             &work_cell,
-            &policies,
+            &mut policies,
             recipe.validation.seed,
             recipe.validation.episodes,
             |_| (),

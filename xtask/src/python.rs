@@ -27,6 +27,15 @@ pub fn with_pip() -> Result<PathBuf> {
     Ok(python)
 }
 
+/// A Python that can import PyTorch: this repository's, the shell's, or the distribution's.
+pub fn with_pytorch() -> Option<PathBuf> {
+    let environment = repository_root().join(".venv/bin/python3");
+    let pythons = [environment, "python3".into(), "/usr/bin/python3".into()];
+    pythons
+        .into_iter()
+        .find(|python| output(command(python).args(["-c", "import torch"])).is_ok())
+}
+
 /// The 11 of Python 3.11.
 fn minor_version(python: &Path) -> Result<u32> {
     let script = "import sys; print(*sys.version_info[:2])";

@@ -49,11 +49,20 @@ impl Stage {
                 .env("RUSTDOCFLAGS", "-D warnings")),
             Self::Unit => {
                 run(cargo().args(["test", "--workspace", "--release"]))?;
-                // The networks against numpy, which the environment has.
-                let numpy = ["numpy", "--", "--ignored"];
-                run(cargo()
-                    .args(["test", "--release", "-p", "gctn", "--lib"])
-                    .args(numpy))
+                // The networks against numpy, which the environment has, and against PyTorch where there is one.
+                let cross_check = |judge: &str| {
+                    let test = ["test", "--release", "-p", "gctn", "--lib"];
+                    run(cargo().args(test).args([judge, "--", "--ignored"]))
+                };
+                cross_check("what_numpy_says")?;
+                if python::with_pytorch().is_some() {
+                    cross_check("what_pytorch_says")
+                } else {
+                    println!(
+                        "not checked: the networks against PyTorch, which no Python here has (CONTRIBUTING.md, \"Cross-checks\")"
+                    );
+                    Ok(())
+                }
             }
             Self::EndToEnd => {
                 let environment = python::Environment::set_up()?;

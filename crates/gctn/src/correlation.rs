@@ -11,7 +11,8 @@ use crate::network::Grid;
 ///
 /// `centers` are continuous indices (x along columns) on the grid without its margin, one a sample;
 /// `turns` the indices of rotations, as many for each sample. What lies at offset w from the centre of the
-/// turned window is what lies at R(-angle) w from the centre in the features; outside is 0.
+/// turned window is what lies at R(-angle) w from the centre in the features; outside is 0. Nearest: half
+/// way between two cells the even one is taken, whatever the last bits of sine and cosine.
 /// Returns N x rotations x C x window x window.
 pub(crate) fn rotated_windows(
     features: &Tensor,
@@ -37,6 +38,10 @@ pub(crate) fn rotated_windows(
                     let offset =
                         Vector2::new(col as f64, row as f64).add_scalar(-(grid.margin as f64));
                     let point = center + inverse * offset;
+                    let point = match sampling {
+                        Interpolation::Bilinear => point,
+                        Interpolation::Nearest => point.map(nearest),
+                    };
                     points.extend((point.component_mul(&normal)).add_scalar(-1.0).iter());
                 }
             }
@@ -57,6 +62,13 @@ pub(crate) fn rotated_windows(
         .grid_sampler_2d(&points, mode, ZEROS, true)
         .view([samples, channels, turn_count, window, window])
         .transpose(1, 2)
+}
+
+/// The nearest whole number, the even one of two that are equally near. Turns of 60 and 90 degrees meet
+/// such ties; sine and cosine miss them by a last bit, one way or the other.
+fn nearest(index: f64) -> f64 {
+    const TIE: f64 = 1e9;
+    ((index * TIE).round() / TIE).round_ties_even()
 }
 
 /// Correlates key features (N x C x H x W, margin included) with windows (N x R x C x k x k).
@@ -261,6 +273,46 @@ mod tests {
             };
             assert_eq!(values(0), [16., 17., 18., 23., 24., 25., 30., 31., 32.]);
             assert_eq!(values(1), [30., 23., 16., 31., 24., 17., 32., 25., 18.]);
+        }
+    }
+
+    #[test]
+    fn half_way_between_cells_the_even_one_is_taken() {
+        // R(-60 deg) (u, v) = (u / 2 + s v, v / 2 - s u) with s = 0.866: the window's corners and the ends
+        // of its axes, by hand. Every other coordinate is a tie.
+        let features = Tensor::arange(49, DOUBLE).view([1, 1, 7, 7]);
+        let grid = grid(7, 7, 3);
+        let sampled = |x: f64, y: f64, turns: usize, kind: Kind| {
+            let features = features.to_kind(kind);
+            let center = [Point2::new(x, y)];
+            let sampling = Interpolation::Nearest;
+            let windows =
+                rotated_windows(&features, 0, &grid, sampling, &center, &[vec![1]], turns);
+            Vec::<f64>::try_from(windows.to_kind(Kind::Double).flatten(0, -1)).unwrap()
+        };
+        for kind in [Kind::Double, Kind::Float] {
+            // About (3, 3), row by row: x 1.63 2.13 2.63 | 2.5 3 3.5 | 3.37 3.87 4.37 and
+            // y 3.37 2.5 1.63 | 3.87 3 2.13 | 4.37 3.5 2.63; 2.5 goes to 2, 3.5 to 4.
+            let cells = [
+                (2, 3),
+                (2, 2),
+                (3, 2),
+                (2, 4),
+                (3, 3),
+                (4, 2),
+                (3, 4),
+                (4, 4),
+                (4, 3),
+            ];
+            let expected = cells.map(|(x, y)| f64::from(7 * y + x));
+            assert_eq!(sampled(3.0, 3.0, 6, kind), expected, "{kind:?}");
+            // A quarter turn about a point between cells: all nine are ties in x, none in y.
+            let cells = [2, 2, 2, 4, 4, 4, 4, 4, 4].map(f64::from);
+            let columns: Vec<_> = sampled(3.5, 3.0, 4, kind)
+                .iter()
+                .map(|at| at % 7.0)
+                .collect();
+            assert_eq!(columns, cells, "{kind:?}");
         }
     }
 

@@ -1,4 +1,5 @@
-//! Against an independent implementation in numpy, written from the definitions: `tests/cross_check.py`.
+//! Against independent implementations, written from the definitions: in numpy (`tests/cross_check.py`) and in
+//! PyTorch (`tests/cross_check_pytorch.py`), which also has every gradient.
 
 use heightmap::{Heightmap, Workspace};
 use nalgebra::Point2;
@@ -6,7 +7,7 @@ use rand::RngExt;
 use rand_chacha::{ChaCha8Rng, rand_core::SeedableRng};
 use safetensors::tensor::{Dtype, TensorView};
 use serde_json::json;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::process::Command;
 use tch::{Device, Kind, Tensor};
 
@@ -14,7 +15,44 @@ use super::{Builder, Model};
 use crate::augment::Warp;
 use crate::input::{Label, encode, tensor};
 use crate::losses::{pick_loss, place_logits, place_loss};
-use crate::{Compact, Network, NetworkConfig, PlaceLoss, Precision, Resnet43};
+use crate::{Compact, ModelCard, Network, NetworkConfig, PlaceLoss, Precision, Resnet43, Storage};
+use crate::{Interpolation, checkpoint};
+
+/// Who checks.
+#[derive(Clone, Copy, Debug)]
+enum Judge {
+    Numpy,
+    PyTorch,
+}
+
+impl Judge {
+    fn script(self) -> &'static str {
+        match self {
+            Self::Numpy => "tests/cross_check.py",
+            Self::PyTorch => "tests/cross_check_pytorch.py",
+        }
+    }
+
+    /// The first Python that can import what the script needs.
+    fn python(self) -> PathBuf {
+        let module = match self {
+            Self::Numpy => "numpy",
+            Self::PyTorch => "torch",
+        };
+        let environment = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../.venv/bin/python3");
+        // The last one has what the distribution's packages brought.
+        let pythons = [environment, "python3".into(), "/usr/bin/python3".into()];
+        let imports = |python: &PathBuf| {
+            let run = Command::new(python)
+                .args(["-c", &format!("import {module}")])
+                .output();
+            run.is_ok_and(|output| output.status.success())
+        };
+        pythons.into_iter().find(imports).unwrap_or_else(|| {
+            panic!("no Python here has {module}: see CONTRIBUTING.md, \"Cross-checks\"")
+        })
+    }
+}
 
 fn scene(config: &NetworkConfig, rng: &mut ChaCha8Rng) -> Heightmap {
     let mut heightmap = Heightmap::new(Workspace {
@@ -30,7 +68,14 @@ fn scene(config: &NetworkConfig, rng: &mut ChaCha8Rng) -> Heightmap {
 }
 
 /// Writes a case: weights, images and labels, and what this crate makes of them; has it checked.
-fn check(config: &NetworkConfig, double: bool, loss: PlaceLoss, sigma_cells: f64, tolerance: f64) {
+fn check(
+    judge: Judge,
+    config: &NetworkConfig,
+    double: bool,
+    loss: PlaceLoss,
+    sigma_cells: f64,
+    tolerance: f64,
+) {
     crate::set_threads(1);
     let rng = &mut ChaCha8Rng::seed_from_u64(7);
     let builder = Builder::random(7, Device::Cpu);
@@ -92,13 +137,25 @@ fn check(config: &NetworkConfig, double: bool, loss: PlaceLoss, sigma_cells: f64
             &mut ChaCha8Rng::seed_from_u64(7),
         ),
     ];
-    let gradients = Tensor::run_backward(&[&losses[0] + &losses[1]], &weights, false, false);
+    // In 32 bits only the values are checked, and the weights are read from a checkpoint.
+    let gradients = if double {
+        Tensor::run_backward(&[&losses[0] + &losses[1]], &weights, false, false)
+    } else {
+        Vec::new()
+    };
 
     let folder = tempfile::tempdir().unwrap();
     let mut tensors: Vec<(String, Tensor)> = Vec::new();
-    for ((name, weight), gradient) in model.parameters.entries.iter().zip(gradients) {
+    for (name, weight) in &model.parameters.entries {
         tensors.push((format!("weight/{name}"), weight.detach()));
+    }
+    for ((name, _), gradient) in model.parameters.entries.iter().zip(gradients) {
         tensors.push((format!("gradient/{name}"), gradient));
+    }
+    if !double {
+        let path = folder.path().join("model.safetensors");
+        let card = ModelCard::new();
+        checkpoint::save(&path, Storage::F32, config, &model.parameters, &card).unwrap();
     }
     for (name, heightmap) in [("observation", &observation), ("goal", &goal)] {
         let (rows, cols) = (config.rows as i64, config.cols as i64);
@@ -122,14 +179,8 @@ fn check(config: &NetworkConfig, double: bool, loss: PlaceLoss, sigma_cells: f64
     std::fs::write(folder.path().join("case.json"), case.to_string()).unwrap();
     write(&folder.path().join("case.safetensors"), &tensors);
 
-    let package = Path::new(env!("CARGO_MANIFEST_DIR"));
-    let environment = package.join("../../.venv/bin/python3");
-    let python = if environment.exists() {
-        environment
-    } else {
-        "python3".into()
-    };
-    let script = package.join("tests/cross_check.py");
+    let python = judge.python();
+    let script = Path::new(env!("CARGO_MANIFEST_DIR")).join(judge.script());
     let output = Command::new(&python)
         .arg(script)
         .arg(folder.path())
@@ -173,9 +224,7 @@ fn small(network: Network) -> NetworkConfig {
     }
 }
 
-#[test]
-#[ignore = "needs numpy: cargo xtask test runs it"]
-fn the_compact_network_is_what_numpy_says() {
+fn the_compact_network_is_what_they_say(judge: Judge) {
     let config = small(Network::Compact(Compact {
         channels: [6, 8, 12, 16],
         feature_channels: 4,
@@ -183,27 +232,79 @@ fn the_compact_network_is_what_numpy_says() {
         ..Compact::default()
     }));
     for loss in [PlaceLoss::AllRotations, PlaceLoss::RightAndOneWrong] {
-        check(&config, true, loss, 0.7, 1e-9);
+        check(judge, &config, true, loss, 0.7, 1e-9);
     }
 }
 
-#[test]
-#[ignore = "needs numpy: cargo xtask test runs it"]
-fn the_published_network_is_what_numpy_says() {
-    use crate::Interpolation::{Bilinear, Nearest};
+fn the_published_network_is_what_they_say(judge: Judge) {
+    use Interpolation::{Bilinear, Nearest};
     for (rotation_sampling, sigma_cells) in [(Nearest, 0.0), (Bilinear, 1.0)] {
         let config = small(Network::Resnet43(Resnet43 {
             crop_px: 16,
             rotation_sampling,
             ..Resnet43::default()
         }));
-        check(&config, true, PlaceLoss::AllRotations, sigma_cells, 1e-9);
+        let loss = PlaceLoss::AllRotations;
+        check(judge, &config, true, loss, sigma_cells, 1e-9);
     }
+}
+
+fn the_compact_network_in_full_size_and_32_bits_is_what_they_say(judge: Judge) {
+    let config = NetworkConfig::compact();
+    check(
+        judge,
+        &config,
+        false,
+        PlaceLoss::RightAndOneWrong,
+        0.7,
+        1e-5,
+    );
+}
+
+#[test]
+#[ignore = "needs numpy: cargo xtask test runs it"]
+fn the_compact_network_is_what_numpy_says() {
+    the_compact_network_is_what_they_say(Judge::Numpy);
+}
+
+#[test]
+#[ignore = "needs numpy: cargo xtask test runs it"]
+fn the_published_network_is_what_numpy_says() {
+    the_published_network_is_what_they_say(Judge::Numpy);
 }
 
 #[test]
 #[ignore = "needs numpy: cargo xtask test runs it"]
 fn the_compact_network_in_full_size_and_32_bits_is_what_numpy_says() {
-    let config = NetworkConfig::compact();
-    check(&config, false, PlaceLoss::RightAndOneWrong, 0.7, 1e-5);
+    the_compact_network_in_full_size_and_32_bits_is_what_they_say(Judge::Numpy);
+}
+
+#[test]
+#[ignore = "needs PyTorch: cargo xtask test runs it where there is one"]
+fn the_compact_network_and_its_gradients_are_what_pytorch_says() {
+    the_compact_network_is_what_they_say(Judge::PyTorch);
+}
+
+#[test]
+#[ignore = "needs PyTorch: cargo xtask test runs it where there is one"]
+fn the_published_network_and_its_gradients_are_what_pytorch_says() {
+    the_published_network_is_what_they_say(Judge::PyTorch);
+}
+
+#[test]
+#[ignore = "needs PyTorch: cargo xtask test runs it where there is one"]
+fn the_compact_network_in_full_size_and_32_bits_is_what_pytorch_says() {
+    the_compact_network_in_full_size_and_32_bits_is_what_they_say(Judge::PyTorch);
+}
+
+#[test]
+#[ignore = "needs PyTorch: cargo xtask test runs it where there is one"]
+fn the_published_network_in_full_size_and_32_bits_is_what_pytorch_says() {
+    // Fewer rotations: without Fourier transforms, each costs seconds.
+    let config = NetworkConfig {
+        rotations: 6,
+        ..NetworkConfig::resnet43()
+    };
+    let loss = PlaceLoss::AllRotations;
+    check(Judge::PyTorch, &config, false, loss, 0.0, 1e-5);
 }

@@ -100,6 +100,16 @@ pub enum BagError {
         /// What is wrong.
         source: msgs::CdrError,
     },
+    /// A message that rosbag2 compressed by itself, and that is none.
+    #[error("topic {topic} at {time:?}: cannot be uncompressed: {reason}")]
+    Packed {
+        /// The topic.
+        topic: String,
+        /// When it was logged.
+        time: Duration,
+        /// What is wrong.
+        reason: String,
+    },
     /// A time that the format cannot hold.
     #[error("time {0:?}, expected less than 2^64 ns")]
     Time(Duration),
@@ -109,7 +119,9 @@ impl BagError {
     pub(crate) fn io(path: &Path, source: io::Error) -> Self {
         let path = path.to_owned();
         match source.kind() {
-            io::ErrorKind::StorageFull | io::ErrorKind::QuotaExceeded => Self::DiskFull { path },
+            io::ErrorKind::StorageFull
+            | io::ErrorKind::QuotaExceeded
+            | io::ErrorKind::FileTooLarge => Self::DiskFull { path },
             io::ErrorKind::UnexpectedEof => Self::Truncated { path },
             _ => Self::Io { path, source },
         }

@@ -5,13 +5,21 @@
 
 mod demonstration;
 mod error;
+mod info;
 mod metadata;
 mod qos;
 mod reader;
+mod scan;
+mod sqlite;
+mod verify;
 mod writer;
 
 pub use demonstration::{Demonstration, DemonstrationError, DemonstrationStep};
 pub use error::BagError;
+pub use info::{BagInfo, FileInfo, RunInfo, TopicInfo, outcome_name};
 pub use qos::Qos;
-pub use reader::{BagReader, Messages, RawMessage, Topic};
-pub use writer::{BagWriter, Compression, TopicHandle, partial_path};
+pub use reader::{BagReader, FileSummary, Messages, RawMessage, Topic};
+pub use verify::{
+    Finding, Findings, Recovery, Verification, VerifiedFile, VerifiedTopic, recover, verify,
+};
+pub use writer::{BagWriter, Compression, Stamps, TopicHandle, WriteOptions, partial_path};

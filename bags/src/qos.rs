@@ -3,7 +3,7 @@
 use serde::{Deserialize, Serialize};
 
 /// What a publisher offered.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, Serialize)]
 pub struct Qos {
     /// Reliable, else best effort.
     pub reliable: bool,
@@ -35,7 +35,7 @@ impl Qos {
 }
 
 /// As `metadata.yaml` of version 9 has it.
-#[derive(Clone, Debug, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(default)]
 pub(crate) struct Profile {
     history: Policy,
@@ -50,14 +50,14 @@ pub(crate) struct Profile {
 }
 
 /// A name, or a number in older versions.
-#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(untagged)]
 enum Policy {
     Name(String),
     Number(i64),
 }
 
-#[derive(Clone, Copy, Debug, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
 struct Interval {
     sec: u64,
     nsec: u64,
@@ -103,8 +103,8 @@ impl From<Qos> for Profile {
     }
 }
 
-impl From<Profile> for Qos {
-    fn from(profile: Profile) -> Self {
+impl From<&Profile> for Qos {
+    fn from(profile: &Profile) -> Self {
         Self {
             reliable: [named("reliable"), Policy::Number(1)].contains(&profile.reliability),
             transient_local: [named("transient_local"), Policy::Number(1)]
@@ -114,36 +114,34 @@ impl From<Profile> for Qos {
     }
 }
 
-/// The text of a channel's `offered_qos_profiles`.
-pub(crate) fn to_yaml(offered: &[Qos]) -> Result<String, serde_yaml_ng::Error> {
-    let profiles: Vec<Profile> = offered.iter().map(|qos| Profile::from(*qos)).collect();
-    serde_yaml_ng::to_string(&profiles)
-}
-
 /// Profiles that cannot be read are left out: they are advice, not data.
-pub(crate) fn from_yaml(text: &str) -> Vec<Qos> {
-    let profiles: Vec<Profile> = serde_yaml_ng::from_str(text).unwrap_or_default();
-    profiles.into_iter().map(Qos::from).collect()
+pub(crate) fn from_yaml(text: &str) -> Vec<Profile> {
+    serde_yaml_ng::from_str(text).unwrap_or_default()
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
+    fn read(text: &str) -> Vec<Qos> {
+        from_yaml(text).iter().map(Qos::from).collect()
+    }
+
     #[test]
     fn profiles_are_read_back() {
         let offered = [Qos::RELIABLE, Qos::LATCHED, Qos::BEST_EFFORT];
-        assert_eq!(from_yaml(&to_yaml(&offered).unwrap()), offered);
+        let text = serde_yaml_ng::to_string(&offered.map(Profile::from)).unwrap();
+        assert_eq!(read(&text), offered);
     }
 
     #[test]
     fn numbers_of_older_versions_are_read_too() {
         let text = "- history: 1\n  depth: 1\n  reliability: 1\n  durability: 1\n  liveliness: 1\n";
-        assert_eq!(from_yaml(text), [Qos::LATCHED]);
+        assert_eq!(read(text), [Qos::LATCHED]);
         assert_eq!(
-            from_yaml("- reliability: 2\n  durability: 2\n  depth: 10"),
+            read("- reliability: 2\n  durability: 2\n  depth: 10"),
             [Qos::BEST_EFFORT]
         );
-        assert_eq!(from_yaml("nonsense"), []);
+        assert_eq!(read("nonsense"), []);
     }
 }

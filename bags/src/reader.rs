@@ -1,20 +1,23 @@
 //! Reading bags.
 
-use crate::metadata::MetadataFile;
-use crate::{BagError, Qos, qos};
+use crate::metadata::{Metadata, MetadataFile};
+use crate::qos::{self, Profile};
+use crate::scan::{self, Event, MAX_RECORD_BYTES, Records, Scan};
+use crate::sqlite::{Rows, Selection, SqliteFile};
+use crate::{BagError, Qos};
+use mcap::records::op;
 use mcap::sans_io::indexed_reader::{IndexedReadEvent, IndexedReader, IndexedReaderOptions};
 use mcap::sans_io::linear_reader::LinearReaderOptions;
 use mcap::sans_io::summary_reader::{SummaryReadEvent, SummaryReader, SummaryReaderOptions};
 use msgs::{Interface, from_cdr};
 use std::collections::BTreeMap;
+use std::ffi::OsStr;
 use std::fs::File;
 use std::io::{BufReader, Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
-
-/// A larger record or chunk is taken for damage.
-const MAX_RECORD_BYTES: usize = 256 << 20;
+use tempfile::NamedTempFile;
 
 /// A topic of a bag.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -33,6 +36,8 @@ pub struct Topic {
     pub type_hash: String,
     /// What its publishers offered.
     pub offered: Vec<Qos>,
+    /// The same with all that the bag says.
+    pub(crate) profiles: Vec<Profile>,
     /// Number of messages.
     pub message_count: u64,
 }
@@ -42,6 +47,8 @@ pub struct Topic {
 pub struct RawMessage {
     /// Its topic; `message_count` is that of the file.
     pub topic: Arc<Topic>,
+    /// Number within the topic by its recorder; 0 from recorders that count nothing.
+    pub sequence: u32,
     /// When it was logged, since the clock's zero.
     pub log_time: Duration,
     /// When it was published.
@@ -84,31 +91,51 @@ impl RawMessage {
     }
 }
 
-struct BagFile {
+struct McapFile {
     path: PathBuf,
     summary: mcap::Summary,
     topics: BTreeMap<u16, Arc<Topic>>,
+}
+
+enum BagFile {
+    Mcap(McapFile),
+    Sqlite(SqliteFile),
+}
+
+/// How the data of each message is compressed, beside what the storage does.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Packing {
+    None,
+    Zstd,
 }
 
 /// A bag. Holds the indices only; messages come one at a time.
 pub struct BagReader {
     path: PathBuf,
     files: Vec<BagFile>,
+    packing: Packing,
     topics: Vec<Topic>,
     notes: BTreeMap<String, String>,
+    /// Files that were compressed as a whole, uncompressed.
+    _unpacked: Vec<NamedTempFile>,
 }
 
 impl BagReader {
-    /// Opens a folder with `metadata.yaml`, or a single MCAP file.
+    /// Opens a folder with `metadata.yaml`, or a single MCAP or SQLite file.
     pub fn open(path: &Path) -> Result<Self, BagError> {
-        let (paths, notes) = if path.is_dir() {
-            read_metadata(path)?
+        let (paths, notes, packing) = if path.is_dir() {
+            let listing = read_metadata(path)?;
+            (listing.paths, listing.notes, listing.packing)
         } else {
-            (vec![path.to_owned()], BTreeMap::new())
+            (vec![path.to_owned()], BTreeMap::new(), Packing::None)
         };
-        let files: Vec<BagFile> = paths.into_iter().map(open_file).collect::<Result<_, _>>()?;
+        let mut unpacked = Vec::new();
+        let mut files = Vec::new();
+        for path in paths {
+            files.push(BagFile::open(path, &mut unpacked)?);
+        }
         let mut topics: BTreeMap<&str, Topic> = BTreeMap::new();
-        for topic in files.iter().flat_map(|file| file.topics.values()) {
+        for topic in files.iter().flat_map(BagFile::topics) {
             topics
                 .entry(&topic.name)
                 .and_modify(|known| known.message_count += topic.message_count)
@@ -118,8 +145,10 @@ impl BagReader {
         Ok(Self {
             path: path.to_owned(),
             files,
+            packing,
             topics,
             notes,
+            _unpacked: unpacked,
         })
     }
 
@@ -138,32 +167,31 @@ impl BagReader {
         &self.notes
     }
 
+    /// The files, in order.
+    pub fn files(&self) -> impl Iterator<Item = FileSummary<'_>> {
+        self.files.iter().map(BagFile::summary)
+    }
+
     /// Log times of the first and of the last message, if there is one.
     pub fn span(&self) -> Option<(Duration, Duration)> {
-        let stats = self
-            .files
+        self.files
             .iter()
-            .filter_map(|file| file.summary.stats.as_ref());
-        let stats = stats.filter(|stats| stats.message_count > 0);
-        let span =
-            |(first, last): (u64, u64), (start, end): (u64, u64)| (first.min(start), last.max(end));
-        let (first, last) = stats
-            .map(|stats| (stats.message_start_time, stats.message_end_time))
-            .reduce(span)?;
-        Some((Duration::from_nanos(first), Duration::from_nanos(last)))
+            .filter_map(|file| file.summary().span)
+            .reduce(|(first, last), (start, end)| (first.min(start), last.max(end)))
     }
 
     /// All messages in the order of the file, checksums verified.
     pub fn messages(&self) -> Messages<'_> {
         Messages {
             files: self.files.iter(),
+            packing: self.packing,
             order: Order::File,
             current: None,
         }
     }
 
     /// Messages of the topics named (all if none) in order of log time, from `from` up to before `until`. Reads only
-    /// the chunks that hold such messages; files without an index are refused.
+    /// the chunks that hold such messages. A file without an index is read from its beginning, in its own order.
     pub fn messages_between(
         &self,
         topics: &[&str],
@@ -171,23 +199,104 @@ impl BagReader {
         until: Duration,
     ) -> Messages<'_> {
         let nanoseconds = |time: Duration| u64::try_from(time.as_nanos()).unwrap_or(u64::MAX);
-        let mut options = IndexedReaderOptions::new()
-            .starting_at(nanoseconds(from))
-            .ending_before(nanoseconds(until))
-            .with_record_length_limit(MAX_RECORD_BYTES);
-        if !topics.is_empty() {
-            options = options.include_topics(topics.iter().copied());
-        }
         Messages {
             files: self.files.iter(),
-            order: Order::Time(Box::new(options)),
+            packing: self.packing,
+            order: Order::Time {
+                topics: topics.iter().map(|&topic| topic.to_owned()).collect(),
+                from_ns: nanoseconds(from),
+                until_ns: nanoseconds(until),
+            },
             current: None,
         }
     }
 }
 
-/// Paths of the files and notes.
-fn read_metadata(folder: &Path) -> Result<(Vec<PathBuf>, BTreeMap<String, String>), BagError> {
+/// One file of a bag.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct FileSummary<'a> {
+    /// Where it lies.
+    pub path: &'a Path,
+    /// `mcap` or `sqlite3`.
+    pub storage: &'static str,
+    /// Messages by its own count.
+    pub message_count: u64,
+    /// Chunks by its own index.
+    pub chunk_count: usize,
+    /// Log times of the first and of the last message, if there is one.
+    pub span: Option<(Duration, Duration)>,
+}
+
+impl BagFile {
+    /// Opens a file by its ending; one compressed as a whole is uncompressed first.
+    fn open(path: PathBuf, unpacked: &mut Vec<NamedTempFile>) -> Result<Self, BagError> {
+        let extension = |path: &Path| path.extension().map(OsStr::to_owned);
+        let (actual, inner) = if extension(&path).as_deref() == Some(OsStr::new("zstd")) {
+            let file = unpack(&path)?;
+            let actual = file.path().to_owned();
+            unpacked.push(file);
+            (actual, path.with_extension(""))
+        } else {
+            (path.clone(), path)
+        };
+        if extension(&inner).as_deref() == Some(OsStr::new("db3")) {
+            return Ok(Self::Sqlite(SqliteFile::open(actual)?));
+        }
+        open_mcap(actual).map(Self::Mcap)
+    }
+
+    fn topics(&self) -> Box<dyn Iterator<Item = &Arc<Topic>> + '_> {
+        match self {
+            Self::Mcap(file) => Box::new(file.topics.values()),
+            Self::Sqlite(file) => Box::new(file.topics.values()),
+        }
+    }
+
+    fn summary(&self) -> FileSummary<'_> {
+        match self {
+            Self::Mcap(file) => {
+                let stats = file.summary.stats.as_ref();
+                let span = stats.filter(|stats| stats.message_count > 0).map(|stats| {
+                    let time = Duration::from_nanos;
+                    (time(stats.message_start_time), time(stats.message_end_time))
+                });
+                FileSummary {
+                    path: &file.path,
+                    storage: "mcap",
+                    message_count: stats.map_or(0, |stats| stats.message_count),
+                    chunk_count: file.summary.chunk_indexes.len(),
+                    span,
+                }
+            }
+            Self::Sqlite(file) => FileSummary {
+                path: &file.path,
+                storage: "sqlite3",
+                message_count: file.message_count,
+                chunk_count: 0,
+                span: file.span,
+            },
+        }
+    }
+}
+
+/// A file that rosbag2 compressed as a whole, into a temporary one.
+fn unpack(path: &Path) -> Result<NamedTempFile, BagError> {
+    let io = |error| BagError::io(path, error);
+    let mut out = NamedTempFile::new().map_err(io)?;
+    let file = File::open(path).map_err(io)?;
+    zstd::stream::copy_decode(file, &mut out).map_err(io)?;
+    Ok(out)
+}
+
+/// What `metadata.yaml` says that a reader needs.
+struct Listing {
+    paths: Vec<PathBuf>,
+    notes: BTreeMap<String, String>,
+    packing: Packing,
+}
+
+/// `metadata.yaml` of a bag.
+pub(crate) fn parse_metadata(folder: &Path) -> Result<Metadata, BagError> {
     let not_a_bag = |reason: String| BagError::NotABag {
         path: folder.to_owned(),
         reason,
@@ -197,28 +306,47 @@ fn read_metadata(folder: &Path) -> Result<(Vec<PathBuf>, BTreeMap<String, String
         Ok(text) => text,
         Err(error) if error.kind() == std::io::ErrorKind::NotFound => {
             return Err(not_a_bag(
-                "metadata.yaml is missing, expected a finished bag".into(),
+                "metadata.yaml is missing, expected a finished bag; try sctn bag recover".into(),
             ));
+        }
+        Err(error) if error.kind() == std::io::ErrorKind::InvalidData => {
+            return Err(not_a_bag("metadata.yaml is no text".into()));
         }
         Err(error) => return Err(BagError::io(&path, error)),
     };
     let file: MetadataFile = serde_yaml_ng::from_str(&text)
         .map_err(|error| not_a_bag(format!("metadata.yaml: {error}")))?;
-    let information = file.information;
-    if information.storage_identifier != "mcap" {
+    Ok(file.information)
+}
+
+fn read_metadata(folder: &Path) -> Result<Listing, BagError> {
+    let not_a_bag = |reason: String| BagError::NotABag {
+        path: folder.to_owned(),
+        reason,
+    };
+    let information = parse_metadata(folder)?;
+    if !["mcap", "sqlite3"].contains(&information.storage_identifier.as_str()) {
         return Err(not_a_bag(format!(
-            "its storage is {:?}, expected \"mcap\"",
+            "its storage is {:?}, expected \"mcap\" or \"sqlite3\"",
             information.storage_identifier
         )));
     }
-    if !information.compression_mode.is_empty()
-        && !information.compression_mode.eq_ignore_ascii_case("none")
-    {
-        return Err(not_a_bag(format!(
-            "its compression mode is {:?}, expected compression by the storage or none",
-            information.compression_mode
-        )));
-    }
+    let format = information.compression_format.as_str();
+    let packing = match information.compression_mode.to_lowercase().as_str() {
+        "" | "none" | "storage" => Packing::None,
+        "file" | "message" if format != "zstd" => {
+            return Err(not_a_bag(format!(
+                "its compression format is {format:?}, expected \"zstd\""
+            )));
+        }
+        "file" => Packing::None,
+        "message" => Packing::Zstd,
+        other => {
+            return Err(not_a_bag(format!(
+                "its compression mode is {other:?}, expected none, file, message or storage"
+            )));
+        }
+    };
     let names = information.relative_file_paths.iter();
     let paths = names.map(|name| match Path::new(name).file_name() {
         // Only names within the folder: the file is not ours to trust.
@@ -233,11 +361,19 @@ fn read_metadata(folder: &Path) -> Result<(Vec<PathBuf>, BTreeMap<String, String
             "relative_file_paths is empty, expected at least one file".into(),
         ));
     }
-    Ok((paths, information.custom_data.unwrap_or_default()))
+    Ok(Listing {
+        paths,
+        notes: information.custom_data.unwrap_or_default(),
+        packing,
+    })
 }
 
-fn open_file(path: PathBuf) -> Result<BagFile, BagError> {
-    let summary = read_summary(&path)?;
+fn open_mcap(path: PathBuf) -> Result<McapFile, BagError> {
+    let mut summary = read_summary(&path)?;
+    // The end of a file may repeat nothing of what is in it.
+    if summary.stats.is_none() || summary.channels.is_empty() {
+        summary = scan_summary(&path, summary)?;
+    }
     let counts = summary
         .stats
         .as_ref()
@@ -250,17 +386,86 @@ fn open_file(path: PathBuf) -> Result<BagFile, BagError> {
         (channel.id, Arc::new(Topic::of(channel, count)))
     };
     let topics = summary.channels.values().map(topic).collect();
-    Ok(BagFile {
+    Ok(McapFile {
         path,
         summary,
         topics,
     })
 }
 
+/// Fills in the channels and counts of a file whose summary lacks them.
+fn scan_summary(path: &Path, mut summary: mcap::Summary) -> Result<mcap::Summary, BagError> {
+    let io = |error| BagError::io(path, error);
+    let mut scan = Scan::new(File::open(path).map_err(io)?, Vec::new()).map_err(io)?;
+    let mut stats = mcap::records::Statistics::default();
+    let mut record = |opcode: u8, body: &[u8]| match opcode {
+        op::SCHEMA => {
+            if let Some((id, name, encoding, data)) = scan::schema(body) {
+                let schema = mcap::Schema {
+                    id,
+                    name,
+                    encoding,
+                    data: data.into(),
+                };
+                summary.schemas.insert(id, Arc::new(schema));
+            }
+        }
+        op::CHANNEL => {
+            if let Some(channel) = scan::channel(body) {
+                let channel = mcap::Channel {
+                    id: channel.id,
+                    topic: channel.topic,
+                    schema: summary.schemas.get(&channel.schema_id).cloned(),
+                    message_encoding: channel.message_encoding,
+                    metadata: channel.metadata,
+                };
+                summary.channels.insert(channel.id, Arc::new(channel));
+            }
+        }
+        op::MESSAGE => {
+            if let Some((header, _)) = scan::message(body) {
+                let time = header.log_time;
+                let first = stats.message_count == 0;
+                stats.message_start_time = if first {
+                    time
+                } else {
+                    stats.message_start_time.min(time)
+                };
+                stats.message_end_time = stats.message_end_time.max(time);
+                stats.message_count += 1;
+                *stats
+                    .channel_message_counts
+                    .entry(header.channel_id)
+                    .or_default() += 1;
+            }
+        }
+        _ => {}
+    };
+    while let Some(event) = scan.next().map_err(io)? {
+        match event {
+            Event::Record { opcode, body, .. } => record(opcode, body),
+            Event::Chunk { records, .. } => {
+                for (_, opcode, body) in Records::new(records).flatten() {
+                    record(opcode, body);
+                }
+            }
+            Event::Damage(damage) => {
+                return Err(BagError::Damaged {
+                    path: path.to_owned(),
+                    reason: format!("{} at byte {}", damage.reason, damage.offset),
+                });
+            }
+        }
+    }
+    summary.stats = Some(stats);
+    Ok(summary)
+}
+
 impl Topic {
-    fn of(channel: &mcap::Channel<'_>, message_count: u64) -> Self {
+    pub(crate) fn of(channel: &mcap::Channel<'_>, message_count: u64) -> Self {
         let metadata = |key: &str| channel.metadata.get(key).cloned().unwrap_or_default();
         let schema = channel.schema.as_deref();
+        let profiles = qos::from_yaml(&metadata("offered_qos_profiles"));
         Self {
             name: channel.topic.clone(),
             type_name: schema.map(|schema| schema.name.clone()).unwrap_or_default(),
@@ -272,13 +477,14 @@ impl Topic {
                 .unwrap_or_default(),
             message_encoding: channel.message_encoding.clone(),
             type_hash: metadata("topic_type_hash"),
-            offered: qos::from_yaml(&metadata("offered_qos_profiles")),
+            offered: profiles.iter().map(Into::into).collect(),
+            profiles,
             message_count,
         }
     }
 }
 
-fn read_summary(path: &Path) -> Result<mcap::Summary, BagError> {
+pub(crate) fn read_summary(path: &Path) -> Result<mcap::Summary, BagError> {
     let io = |error| BagError::io(path, error);
     let mcap = |error| BagError::mcap(path, error);
     let mut file = File::open(path).map_err(io)?;
@@ -309,7 +515,7 @@ fn read_summary(path: &Path) -> Result<mcap::Summary, BagError> {
     }
     let options = SummaryReaderOptions::default()
         .with_file_size(size)
-        .with_record_length_limit(MAX_RECORD_BYTES);
+        .with_record_length_limit(MAX_RECORD_BYTES as usize);
     let mut reader = SummaryReader::new_with_options(options);
     while let Some(event) = reader.next_event() {
         match event.map_err(mcap)? {
@@ -320,32 +526,59 @@ fn read_summary(path: &Path) -> Result<mcap::Summary, BagError> {
             SummaryReadEvent::SeekRequest(to) => reader.notify_seeked(file.seek(to).map_err(io)?),
         }
     }
-    reader.finish().ok_or_else(|| BagError::Damaged {
-        path: path.to_owned(),
-        reason: "it has no summary".to_owned(),
-    })
+    Ok(reader.finish().unwrap_or_default())
 }
 
+#[derive(Debug)]
 enum Order {
     File,
-    Time(Box<IndexedReaderOptions>),
+    Time {
+        topics: Vec<String>,
+        from_ns: u64,
+        until_ns: u64,
+    },
 }
 
-enum Source {
-    Linear(Box<mcap::io::MessageReader<BufReader<File>>>),
+impl Order {
+    fn includes(&self, topic: &str, time_ns: u64) -> bool {
+        match self {
+            Self::File => true,
+            Self::Time {
+                topics,
+                from_ns,
+                until_ns,
+            } => {
+                (topics.is_empty() || topics.iter().any(|name| name == topic))
+                    && (*from_ns..*until_ns).contains(&time_ns)
+            }
+        }
+    }
+}
+
+enum Source<'a> {
+    Linear {
+        bag_file: &'a McapFile,
+        reader: Box<mcap::io::MessageReader<BufReader<File>>>,
+    },
     Indexed {
+        bag_file: &'a McapFile,
         reader: Box<IndexedReader>,
         file: File,
         size: u64,
         buffer: Vec<u8>,
+    },
+    Sqlite {
+        bag_file: &'a SqliteFile,
+        rows: Rows,
     },
 }
 
 /// Messages of a bag, one at a time. Nothing comes after an error.
 pub struct Messages<'a> {
     files: std::slice::Iter<'a, BagFile>,
+    packing: Packing,
     order: Order,
-    current: Option<(&'a BagFile, Source)>,
+    current: Option<Source<'a>>,
 }
 
 impl Iterator for Messages<'_> {
@@ -356,13 +589,16 @@ impl Iterator for Messages<'_> {
             if self.current.is_none() {
                 let file = self.files.next()?;
                 match Source::open(file, &self.order) {
-                    Ok(source) => self.current = Some((file, source)),
+                    Ok(source) => self.current = Some(source),
                     Err(error) => return Some(Err(self.end(error))),
                 }
             }
-            let (file, source) = self.current.as_mut()?;
-            match source.next(file) {
-                Ok(Some(message)) => return Some(Ok(message)),
+            let source = self.current.as_mut()?;
+            match source.next(&self.order) {
+                Ok(Some(message)) => {
+                    let message = self.packing.open(message);
+                    return Some(message.map_err(|error| self.end(error)));
+                }
                 Ok(None) => self.current = None,
                 Err(error) => return Some(Err(self.end(error))),
             }
@@ -378,121 +614,186 @@ impl Messages<'_> {
     }
 }
 
-impl Source {
-    fn open(bag_file: &BagFile, order: &Order) -> Result<Self, BagError> {
+impl Packing {
+    fn open(self, message: RawMessage) -> Result<RawMessage, BagError> {
+        if self == Self::None {
+            return Ok(message);
+        }
+        let mut data = Vec::new();
+        let read = zstd::stream::read::Decoder::new(message.data.as_slice())
+            .and_then(|decoder| decoder.take(MAX_RECORD_BYTES).read_to_end(&mut data));
+        match read {
+            Ok(_) => Ok(RawMessage { data, ..message }),
+            Err(error) => Err(BagError::Packed {
+                topic: message.topic.name.clone(),
+                time: message.log_time,
+                reason: error.to_string(),
+            }),
+        }
+    }
+}
+
+impl<'a> Source<'a> {
+    fn open(bag_file: &'a BagFile, order: &Order) -> Result<Self, BagError> {
+        let bag_file = match bag_file {
+            BagFile::Mcap(file) => file,
+            BagFile::Sqlite(bag_file) => {
+                let ns = |time: u64| i64::try_from(time).unwrap_or(i64::MAX);
+                let selection = match order {
+                    Order::File => Selection::File,
+                    Order::Time {
+                        topics,
+                        from_ns,
+                        until_ns,
+                    } => Selection::Time {
+                        topics: bag_file.ids(topics),
+                        from_ns: ns(*from_ns),
+                        until_ns: ns(*until_ns),
+                    },
+                };
+                let rows = Rows::new(selection);
+                return Ok(Self::Sqlite { bag_file, rows });
+            }
+        };
         let path = &bag_file.path;
         let io = |error| BagError::io(path, error);
         let file = File::open(path).map_err(io)?;
+        let summary = &bag_file.summary;
+        let messages = summary
+            .stats
+            .as_ref()
+            .is_none_or(|stats| stats.message_count > 0);
+        let indexed = !summary.chunk_indexes.is_empty() || !messages;
         match order {
-            Order::File => {
+            Order::Time {
+                topics,
+                from_ns,
+                until_ns,
+            } if indexed => {
+                let mut options = IndexedReaderOptions::new()
+                    .starting_at(*from_ns)
+                    .ending_before(*until_ns)
+                    .with_record_length_limit(MAX_RECORD_BYTES as usize);
+                if !topics.is_empty() {
+                    options = options.include_topics(topics.iter().cloned());
+                }
+                let reader = IndexedReader::new_with_options(summary, options)
+                    .map_err(|error| BagError::mcap(path, error))?;
+                Ok(Self::Indexed {
+                    bag_file,
+                    reader: Box::new(reader),
+                    size: file.metadata().map_err(io)?.len(),
+                    file,
+                    buffer: Vec::new(),
+                })
+            }
+            _ => {
                 let options = LinearReaderOptions::default()
                     .with_prevalidate_chunk_crcs(true)
                     .with_validate_data_section_crc(true)
                     .with_validate_summary_section_crc(true)
-                    .with_record_length_limit(MAX_RECORD_BYTES);
+                    .with_record_length_limit(MAX_RECORD_BYTES as usize);
                 let reader =
                     mcap::io::MessageReader::new_with_options(BufReader::new(file), options);
-                Ok(Self::Linear(Box::new(reader)))
-            }
-            Order::Time(options) => {
-                let messages = bag_file
-                    .summary
-                    .stats
-                    .as_ref()
-                    .is_none_or(|stats| stats.message_count > 0);
-                if bag_file.summary.chunk_indexes.is_empty() && messages {
-                    let reason = "it has no index of its chunks".to_owned();
-                    return Err(BagError::Damaged {
-                        path: path.clone(),
-                        reason,
-                    });
-                }
-                let size = file.metadata().map_err(io)?.len();
-                let reader = IndexedReader::new_with_options(
-                    &bag_file.summary,
-                    IndexedReaderOptions::clone(options),
-                )
-                .map_err(|error| BagError::mcap(path, error))?;
-                Ok(Self::Indexed {
+                Ok(Self::Linear {
+                    bag_file,
                     reader: Box::new(reader),
-                    file,
-                    size,
-                    buffer: Vec::new(),
                 })
             }
         }
     }
 
-    fn next(&mut self, bag_file: &BagFile) -> Result<Option<RawMessage>, BagError> {
-        let path = &bag_file.path;
-        let mcap = |error| BagError::mcap(path, error);
-        let damaged = |reason: String| BagError::Damaged {
-            path: path.clone(),
-            reason,
-        };
+    fn next(&mut self, order: &Order) -> Result<Option<RawMessage>, BagError> {
         match self {
-            Self::Linear(reader) => {
-                let Some(message) = reader.next() else {
-                    return Ok(None);
-                };
-                let message = message.map_err(mcap)?;
-                let channel = &message.channel;
-                // Channels of files without a full summary are known from the data section alone.
-                let topic = bag_file.topics.get(&channel.id);
-                let topic = topic
-                    .cloned()
-                    .unwrap_or_else(|| Arc::new(Topic::of(channel, 0)));
-                Ok(Some(RawMessage {
-                    topic,
-                    log_time: Duration::from_nanos(message.log_time),
-                    publish_time: Duration::from_nanos(message.publish_time),
-                    data: message.data.into_owned(),
-                }))
+            Self::Sqlite { bag_file, rows } => Ok(rows.next(bag_file)?.map(|message| RawMessage {
+                topic: message.topic,
+                sequence: 0,
+                log_time: message.time,
+                publish_time: message.time,
+                data: message.data,
+            })),
+            Self::Linear { bag_file, reader } => {
+                for message in reader {
+                    let message = message.map_err(|error| BagError::mcap(&bag_file.path, error))?;
+                    let channel = &message.channel;
+                    if !order.includes(&channel.topic, message.log_time) {
+                        continue;
+                    }
+                    // Channels of files without a full summary are known from the data section alone.
+                    let topic = bag_file.topics.get(&channel.id);
+                    let topic = topic
+                        .cloned()
+                        .unwrap_or_else(|| Arc::new(Topic::of(channel, 0)));
+                    return Ok(Some(RawMessage {
+                        topic,
+                        sequence: message.sequence,
+                        log_time: Duration::from_nanos(message.log_time),
+                        publish_time: Duration::from_nanos(message.publish_time),
+                        data: message.data.into_owned(),
+                    }));
+                }
+                Ok(None)
             }
             Self::Indexed {
+                bag_file,
                 reader,
                 file,
                 size,
                 buffer,
-            } => {
-                while let Some(event) = reader.next_event() {
-                    match event.map_err(mcap)? {
-                        IndexedReadEvent::ReadChunkRequest { offset, length } => {
-                            if offset
-                                .checked_add(length as u64)
-                                .is_none_or(|end| end > *size)
-                            {
-                                return Err(damaged(format!(
-                                    "its index names a chunk beyond its {size} bytes"
-                                )));
-                            }
-                            buffer.resize(length, 0);
-                            file.seek(SeekFrom::Start(offset))
-                                .and_then(|_| file.read_exact(buffer))
-                                .map_err(|error| BagError::io(path, error))?;
-                            reader
-                                .insert_chunk_record_data(offset, buffer)
-                                .map_err(mcap)?;
-                        }
-                        IndexedReadEvent::Message { header, data } => {
-                            let topic = bag_file.topics.get(&header.channel_id).cloned();
-                            let topic = topic.ok_or_else(|| {
-                                damaged(format!(
-                                    "a message of the unknown channel {}",
-                                    header.channel_id
-                                ))
-                            })?;
-                            return Ok(Some(RawMessage {
-                                topic,
-                                log_time: Duration::from_nanos(header.log_time),
-                                publish_time: Duration::from_nanos(header.publish_time),
-                                data: data.to_vec(),
-                            }));
-                        }
-                    }
+            } => next_indexed(bag_file, reader, file, *size, buffer),
+        }
+    }
+}
+
+fn next_indexed(
+    bag_file: &McapFile,
+    reader: &mut IndexedReader,
+    file: &mut File,
+    size: u64,
+    buffer: &mut Vec<u8>,
+) -> Result<Option<RawMessage>, BagError> {
+    let path = &bag_file.path;
+    let mcap = |error| BagError::mcap(path, error);
+    let damaged = |reason: String| BagError::Damaged {
+        path: path.clone(),
+        reason,
+    };
+    while let Some(event) = reader.next_event() {
+        match event.map_err(mcap)? {
+            IndexedReadEvent::ReadChunkRequest { offset, length } => {
+                if offset
+                    .checked_add(length as u64)
+                    .is_none_or(|end| end > size)
+                {
+                    return Err(damaged(format!(
+                        "its index names a chunk beyond its {size} bytes"
+                    )));
                 }
-                Ok(None)
+                buffer.resize(length, 0);
+                file.seek(SeekFrom::Start(offset))
+                    .and_then(|_| file.read_exact(buffer))
+                    .map_err(|error| BagError::io(path, error))?;
+                reader
+                    .insert_chunk_record_data(offset, buffer)
+                    .map_err(mcap)?;
+            }
+            IndexedReadEvent::Message { header, data } => {
+                let topic = bag_file.topics.get(&header.channel_id).cloned();
+                let topic = topic.ok_or_else(|| {
+                    damaged(format!(
+                        "a message of the unknown channel {}",
+                        header.channel_id
+                    ))
+                })?;
+                return Ok(Some(RawMessage {
+                    topic,
+                    sequence: header.sequence,
+                    log_time: Duration::from_nanos(header.log_time),
+                    publish_time: Duration::from_nanos(header.publish_time),
+                    data: data.to_vec(),
+                }));
             }
         }
     }
+    Ok(None)
 }

@@ -4,7 +4,7 @@ use crate::metadata::{
     FileInformation, Metadata, MetadataFile, Nanoseconds, Profiles, StartingTime, TopicCount,
     TopicMetadata,
 };
-use crate::{BagError, Qos, qos};
+use crate::{BagError, Qos, Topic};
 use mcap::records::MessageHeader;
 use msgs::{Description, Interface, to_cdr_in};
 use std::collections::BTreeMap;
@@ -31,15 +31,66 @@ impl Default for Compression {
 
 /// Target size of a chunk before compression: what a reader must hold in memory.
 const CHUNK_BYTES: u64 = 4 << 20;
+/// Name of the metadata records that keep the notes of a bag that has no `metadata.yaml` yet.
+pub(crate) const NOTES_RECORD: &str = "sctn notes";
+
+/// How a bag is written.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct WriteOptions {
+    /// How chunks are compressed.
+    pub compression: Compression,
+    /// A new file begins when the present one has this many bytes.
+    pub split_bytes: Option<u64>,
+    /// A new file begins when the present one spans this much log time.
+    pub split_duration: Option<Duration>,
+}
+
+impl From<Compression> for WriteOptions {
+    fn from(compression: Compression) -> Self {
+        Self {
+            compression,
+            ..Self::default()
+        }
+    }
+}
 
 /// A topic of a [`BagWriter`].
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
 pub struct TopicHandle(usize);
 
 struct WrittenTopic {
+    /// In the present file.
     channel_id: u16,
     metadata: TopicMetadata,
+    definition: Vec<u8>,
+    definition_encoding: String,
     message_count: u64,
+}
+
+/// Numbers and times of a message.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Stamps {
+    /// Number within the topic; a gap says that messages are missing.
+    pub sequence: u32,
+    /// When it was received, since the clock's zero.
+    pub log_time: Duration,
+    /// When it was sent.
+    pub publish_time: Duration,
+}
+
+/// The file that is being written.
+struct OpenFile {
+    path: PathBuf,
+    name: String,
+    file: File,
+    writer: mcap::Writer<BufWriter<File>>,
+    message_count: u64,
+    /// Log times of the first and of the last message.
+    span_ns: Option<(u64, u64)>,
+    /// Bytes of messages since the size of the file was looked up.
+    unmeasured: u64,
+    /// Notes that stand in this file.
+    noted: usize,
 }
 
 /// Writes one bag. Only [`finish`](Self::finish) gives it its name; until then it is `NAME.partial`, of which
@@ -48,14 +99,14 @@ struct WrittenTopic {
 pub struct BagWriter {
     folder: PathBuf,
     partial: PathBuf,
-    file_path: PathBuf,
-    file_name: String,
-    file: File,
-    writer: mcap::Writer<BufWriter<File>>,
+    name: String,
+    options: WriteOptions,
+    open: OpenFile,
+    /// Files that are complete.
+    complete: Vec<FileInformation>,
+    complete_bytes: u64,
     topics: Vec<WrittenTopic>,
     custom_data: BTreeMap<String, String>,
-    /// Times of the first and of the last message.
-    span_ns: Option<(u64, u64)>,
     buffer: Vec<u8>,
 }
 
@@ -68,7 +119,8 @@ pub fn partial_path(folder: &Path) -> PathBuf {
 
 impl BagWriter {
     /// Begins a bag. The folder must not exist, nor the rest of an earlier try; its parent must.
-    pub fn create(folder: &Path, compression: Compression) -> Result<Self, BagError> {
+    pub fn create(folder: &Path, options: impl Into<WriteOptions>) -> Result<Self, BagError> {
+        let options = options.into();
         let Some(name) = folder.file_name().and_then(|name| name.to_str()) else {
             let reason = "expected a path that ends in a name of valid Unicode".to_owned();
             return Err(BagError::NotABag {
@@ -88,37 +140,16 @@ impl BagWriter {
             },
             _ => BagError::io(&partial, source),
         })?;
-        let file_name = format!("{name}_0.mcap");
-        let file_path = partial.join(&file_name);
-        let file =
-            File::create_new(&file_path).map_err(|source| BagError::io(&file_path, source))?;
-        let clone = file
-            .try_clone()
-            .map_err(|source| BagError::io(&file_path, source))?;
-        let (compression, level) = match compression {
-            Compression::None => (None, 0),
-            Compression::Zstd(level) => (Some(mcap::Compression::Zstd), level),
-        };
-        let writer = mcap::WriteOptions::new()
-            .profile("ros2")
-            .library(concat!("sctn ", env!("CARGO_PKG_VERSION")))
-            .compression(compression)
-            .compression_level(level)
-            // Threads of its own would cost more than they win on chunks of this size.
-            .compression_threads(0)
-            .chunk_size(Some(CHUNK_BYTES))
-            .create(BufWriter::new(clone))
-            .map_err(|error| BagError::mcap(&file_path, error))?;
         Ok(Self {
             folder: folder.to_owned(),
+            open: OpenFile::create(&partial, format!("{name}_0.mcap"), options.compression)?,
+            name: name.to_owned(),
             partial,
-            file_path,
-            file_name,
-            file,
-            writer,
+            options,
+            complete: Vec::new(),
+            complete_bytes: 0,
             topics: Vec::new(),
             custom_data: BTreeMap::new(),
-            span_ns: None,
             buffer: Vec::new(),
         })
     }
@@ -158,41 +189,8 @@ impl BagWriter {
         type_hash: &str,
         offered: &[Qos],
     ) -> Result<TopicHandle, BagError> {
-        if let Some(index) = self
-            .topics
-            .iter()
-            .position(|topic| topic.metadata.name == name)
-        {
-            let actual = &self.topics[index].metadata.type_name;
-            if actual != type_name {
-                let (topic, actual, expected) =
-                    (name.to_owned(), actual.clone(), type_name.to_owned());
-                return Err(BagError::Conflict {
-                    topic,
-                    actual,
-                    expected,
-                });
-            }
-            return Ok(TopicHandle(index));
-        }
-        let mut metadata = BTreeMap::new();
-        metadata.insert(
-            "offered_qos_profiles".to_owned(),
-            qos::to_yaml(offered).map_err(|error| self.yaml(error))?,
-        );
-        metadata.insert("topic_type_hash".to_owned(), type_hash.to_owned());
-        let mcap = |error| BagError::mcap(&self.file_path, error);
-        let schema = self
-            .writer
-            .add_schema(type_name, "ros2msg", definition.as_bytes())
-            .map_err(mcap)?;
-        let channel_id = self
-            .writer
-            .add_channel(schema, name, "cdr", &metadata)
-            .map_err(mcap)?;
-        self.topics.push(WrittenTopic {
-            channel_id,
-            metadata: TopicMetadata {
+        self.add_any_topic(
+            TopicMetadata {
                 name: name.to_owned(),
                 type_name: type_name.to_owned(),
                 serialization_format: "cdr".to_owned(),
@@ -201,8 +199,56 @@ impl BagWriter {
                 ),
                 type_description_hash: type_hash.to_owned(),
             },
+            definition.as_bytes(),
+            "ros2msg",
+        )
+    }
+
+    /// Adds a topic as it stands in another bag.
+    pub fn add_topic_of(&mut self, topic: &Topic) -> Result<TopicHandle, BagError> {
+        self.add_any_topic(
+            TopicMetadata {
+                name: topic.name.clone(),
+                type_name: topic.type_name.clone(),
+                serialization_format: topic.message_encoding.clone(),
+                offered_qos_profiles: Profiles::List(topic.profiles.clone()),
+                type_description_hash: topic.type_hash.clone(),
+            },
+            &topic.definition,
+            &topic.definition_encoding,
+        )
+    }
+
+    fn add_any_topic(
+        &mut self,
+        metadata: TopicMetadata,
+        definition: &[u8],
+        definition_encoding: &str,
+    ) -> Result<TopicHandle, BagError> {
+        let known = self
+            .topics
+            .iter()
+            .position(|topic| topic.metadata.name == metadata.name);
+        if let Some(index) = known {
+            let actual = &self.topics[index].metadata.type_name;
+            if *actual != metadata.type_name {
+                return Err(BagError::Conflict {
+                    actual: actual.clone(),
+                    topic: metadata.name,
+                    expected: metadata.type_name,
+                });
+            }
+            return Ok(TopicHandle(index));
+        }
+        let mut topic = WrittenTopic {
+            channel_id: 0,
+            metadata,
+            definition: definition.to_vec(),
+            definition_encoding: definition_encoding.to_owned(),
             message_count: 0,
-        });
+        };
+        self.open.add(&mut topic)?;
+        self.topics.push(topic);
         Ok(TopicHandle(self.topics.len() - 1))
     }
 
@@ -224,20 +270,79 @@ impl BagWriter {
         publish_time: Duration,
         cdr: &[u8],
     ) -> Result<(), BagError> {
-        let (log_time, publish_time) = (nanoseconds(log_time)?, nanoseconds(publish_time)?);
-        let topic = &mut self.topics[topic.0];
-        let header = MessageHeader {
-            channel_id: topic.channel_id,
-            sequence: topic.message_count as u32,
+        let stamps = Stamps {
+            sequence: self.topics[topic.0].message_count as u32,
             log_time,
             publish_time,
         };
-        self.writer
-            .write_to_known_channel(&header, cdr)
-            .map_err(|error| BagError::mcap(&self.file_path, error))?;
+        self.write_stamped(topic, stamps, cdr)
+    }
+
+    /// [`Self::write_cdr`] with a number of the caller's.
+    pub fn write_stamped(
+        &mut self,
+        topic: TopicHandle,
+        stamps: Stamps,
+        cdr: &[u8],
+    ) -> Result<(), BagError> {
+        let log_time = nanoseconds(stamps.log_time)?;
+        if self.is_split_due(log_time)? {
+            self.split()?;
+        }
+        let topic = &mut self.topics[topic.0];
+        let header = MessageHeader {
+            channel_id: topic.channel_id,
+            sequence: stamps.sequence,
+            log_time,
+            publish_time: nanoseconds(stamps.publish_time)?,
+        };
+        self.open.write(&header, cdr)?;
         topic.message_count += 1;
-        let (first, last) = self.span_ns.unwrap_or((log_time, log_time));
-        self.span_ns = Some((first.min(log_time), last.max(log_time)));
+        Ok(())
+    }
+
+    fn is_split_due(&mut self, log_time: u64) -> Result<bool, BagError> {
+        let open = &mut self.open;
+        if open.message_count == 0 {
+            return Ok(false);
+        }
+        if let (Some(limit), Some((first, _))) = (self.options.split_duration, open.span_ns)
+            && u128::from(log_time.saturating_sub(first)) >= limit.as_nanos()
+        {
+            return Ok(true);
+        }
+        match self.options.split_bytes {
+            // Looked up once a chunk.
+            Some(limit) if open.unmeasured >= CHUNK_BYTES.min(limit) => {
+                open.unmeasured = 0;
+                Ok(open.bytes()? >= limit)
+            }
+            _ => Ok(false),
+        }
+    }
+
+    /// Completes the present file and begins the next one.
+    pub fn split(&mut self) -> Result<(), BagError> {
+        let name = format!("{}_{}.mcap", self.name, self.complete.len() + 1);
+        let mut next = OpenFile::create(&self.partial, name, self.options.compression)?;
+        for topic in &mut self.topics {
+            next.add(topic)?;
+        }
+        let done = std::mem::replace(&mut self.open, next);
+        // The notes of a bag that is never finished stand in its first file.
+        self.open.noted = self.custom_data.len();
+        self.close(done, None)
+    }
+
+    /// Puts a complete file on the disk.
+    fn close(
+        &mut self,
+        done: OpenFile,
+        metadata: Option<&mcap::records::Metadata>,
+    ) -> Result<(), BagError> {
+        let information = done.information();
+        self.complete_bytes += done.finish(metadata)?;
+        self.complete.push(information);
         Ok(())
     }
 
@@ -270,26 +375,31 @@ impl BagWriter {
 
     /// Closes the chunk and hands everything to the system: it survives the end of this process.
     pub fn flush(&mut self) -> Result<(), BagError> {
-        self.writer
-            .flush()
-            .map_err(|error| BagError::mcap(&self.file_path, error))
+        self.open.flush(&self.custom_data)
     }
 
     /// [`Self::flush`], and waits until the disk has it: it survives a power cut.
     pub fn sync(&mut self) -> Result<(), BagError> {
         self.flush()?;
-        self.file
+        self.open
+            .file
             .sync_data()
-            .map_err(|error| BagError::io(&self.file_path, error))
+            .map_err(|error| BagError::io(&self.open.path, error))
     }
 
-    /// Bytes in the file so far, without the open chunk.
+    /// Bytes in the files so far, without the open chunk.
     pub fn bytes(&self) -> Result<u64, BagError> {
-        Ok(self
-            .file
-            .metadata()
-            .map_err(|error| BagError::io(&self.file_path, error))?
-            .len())
+        Ok(self.complete_bytes + self.open.bytes()?)
+    }
+
+    /// Where the bag lies while it is written.
+    pub fn partial(&self) -> &Path {
+        &self.partial
+    }
+
+    /// Files so far.
+    pub fn file_count(&self) -> usize {
+        self.complete.len() + 1
     }
 
     /// Messages so far.
@@ -298,31 +408,25 @@ impl BagWriter {
     }
 
     /// Completes the bag and gives it its name.
-    pub fn finish(mut self) -> Result<(), BagError> {
+    pub fn finish(self) -> Result<(), BagError> {
         let information = self.metadata();
-        let text = serde_yaml_ng::to_string(&information).map_err(|error| self.yaml(error))?;
+        let yaml = |error: serde_yaml_ng::Error| BagError::Damaged {
+            path: self.partial.join("metadata.yaml"),
+            reason: error.to_string(),
+        };
+        let text = serde_yaml_ng::to_string(&information).map_err(yaml)?;
+        let whole = serde_yaml_ng::to_string(&MetadataFile { information }).map_err(yaml)?;
         // As rosbag2 does, so that the file alone is a bag too.
         let record = mcap::records::Metadata {
             name: "rosbag2".to_owned(),
             metadata: BTreeMap::from([("serialized_metadata".to_owned(), text)]),
         };
-        let mcap = |error| BagError::mcap(&self.file_path, error);
-        self.writer.write_metadata(&record).map_err(mcap)?;
-        self.writer.finish().map_err(mcap)?;
-        let io = |error| BagError::io(&self.file_path, error);
-        self.writer.into_inner().flush().map_err(io)?;
-        self.file.sync_all().map_err(io)?;
+        self.open.finish(Some(&record))?;
 
         let path = self.partial.join("metadata.yaml");
-        let yaml = serde_yaml_ng::to_string(&MetadataFile { information }).map_err(|error| {
-            BagError::Damaged {
-                path: path.clone(),
-                reason: error.to_string(),
-            }
-        })?;
         let io = |error| BagError::io(&path, error);
         let mut file = File::create_new(&path).map_err(io)?;
-        file.write_all(yaml.as_bytes()).map_err(io)?;
+        file.write_all(whole.as_bytes()).map_err(io)?;
         file.sync_all().map_err(io)?;
         sync_folder(&self.partial)?;
         fs::rename(&self.partial, &self.folder)
@@ -336,13 +440,13 @@ impl BagWriter {
     }
 
     fn metadata(&self) -> Metadata {
-        let (first, last) = self.span_ns.unwrap_or((0, 0));
-        let starting_time = StartingTime {
-            nanoseconds_since_epoch: first,
-        };
-        let duration = Nanoseconds {
-            nanoseconds: last - first,
-        };
+        let mut files = self.complete.clone();
+        files.push(self.open.information());
+        let with_messages = || files.iter().filter(|file| file.message_count > 0);
+        let first = |file: &FileInformation| file.starting_time.nanoseconds_since_epoch;
+        let last = |file: &FileInformation| first(file) + file.duration.nanoseconds;
+        let start = with_messages().map(first).min().unwrap_or(0);
+        let end = with_messages().map(last).max().unwrap_or(0);
         let topics = self.topics.iter().map(|topic| TopicCount {
             topic_metadata: topic.metadata.clone(),
             message_count: topic.message_count,
@@ -350,30 +454,151 @@ impl BagWriter {
         Metadata {
             version: 9,
             storage_identifier: "mcap".to_owned(),
-            duration,
-            starting_time,
+            duration: Nanoseconds {
+                nanoseconds: end - start,
+            },
+            starting_time: StartingTime {
+                nanoseconds_since_epoch: start,
+            },
             message_count: self.message_count(),
             topics_with_message_count: topics.collect(),
             // Chunks are compressed by the storage, not by rosbag2.
             compression_format: String::new(),
             compression_mode: String::new(),
-            relative_file_paths: vec![self.file_name.clone()],
-            files: vec![FileInformation {
-                path: self.file_name.clone(),
-                starting_time,
-                duration,
-                message_count: self.message_count(),
-            }],
+            relative_file_paths: files.iter().map(|file| file.path.clone()).collect(),
+            files,
             custom_data: (!self.custom_data.is_empty()).then(|| self.custom_data.clone()),
             ros_distro: "jazzy".to_owned(),
         }
     }
+}
 
-    fn yaml(&self, error: serde_yaml_ng::Error) -> BagError {
-        BagError::Damaged {
-            path: self.file_path.clone(),
-            reason: error.to_string(),
+impl OpenFile {
+    fn create(folder: &Path, name: String, compression: Compression) -> Result<Self, BagError> {
+        let path = folder.join(&name);
+        let io = |source| BagError::io(&path, source);
+        let file = File::create_new(&path).map_err(io)?;
+        let clone = file.try_clone().map_err(io)?;
+        let (compression, level) = match compression {
+            Compression::None => (None, 0),
+            Compression::Zstd(level) => (Some(mcap::Compression::Zstd), level),
+        };
+        let writer = mcap::WriteOptions::new()
+            .profile("ros2")
+            .library(concat!("sctn ", env!("CARGO_PKG_VERSION")))
+            .compression(compression)
+            .compression_level(level)
+            // Threads of its own would cost more than they win on chunks of this size.
+            .compression_threads(0)
+            .chunk_size(Some(CHUNK_BYTES))
+            .create(BufWriter::new(clone))
+            .map_err(|error| BagError::mcap(&path, error))?;
+        Ok(Self {
+            path,
+            name,
+            file,
+            writer,
+            message_count: 0,
+            span_ns: None,
+            unmeasured: 0,
+            noted: 0,
+        })
+    }
+
+    /// Tells the file of a topic.
+    fn add(&mut self, topic: &mut WrittenTopic) -> Result<(), BagError> {
+        let TopicMetadata {
+            name,
+            type_name,
+            serialization_format,
+            offered_qos_profiles,
+            type_description_hash,
+        } = &topic.metadata;
+        let offered =
+            serde_yaml_ng::to_string(offered_qos_profiles).map_err(|error| BagError::Damaged {
+                path: self.path.clone(),
+                reason: error.to_string(),
+            })?;
+        let metadata = BTreeMap::from([
+            ("offered_qos_profiles".to_owned(), offered),
+            (
+                "topic_type_hash".to_owned(),
+                type_description_hash.to_owned(),
+            ),
+        ]);
+        let mcap = |error| BagError::mcap(&self.path, error);
+        let schema = match (type_name.as_str(), topic.definition.as_slice()) {
+            ("", []) => 0,
+            (name, definition) => self
+                .writer
+                .add_schema(name, &topic.definition_encoding, definition)
+                .map_err(mcap)?,
+        };
+        topic.channel_id = self
+            .writer
+            .add_channel(schema, name, serialization_format, &metadata)
+            .map_err(mcap)?;
+        Ok(())
+    }
+
+    fn write(&mut self, header: &MessageHeader, data: &[u8]) -> Result<(), BagError> {
+        self.writer
+            .write_to_known_channel(header, data)
+            .map_err(|error| BagError::mcap(&self.path, error))?;
+        self.message_count += 1;
+        self.unmeasured += data.len() as u64;
+        let time = header.log_time;
+        let (first, last) = self.span_ns.unwrap_or((time, time));
+        self.span_ns = Some((first.min(time), last.max(time)));
+        Ok(())
+    }
+
+    fn flush(&mut self, notes: &BTreeMap<String, String>) -> Result<(), BagError> {
+        let mcap = |error| BagError::mcap(&self.path, error);
+        if self.noted < notes.len() {
+            self.noted = notes.len();
+            let record = mcap::records::Metadata {
+                name: NOTES_RECORD.to_owned(),
+                metadata: notes.clone(),
+            };
+            self.writer.write_metadata(&record).map_err(mcap)?;
         }
+        self.writer.flush().map_err(mcap)
+    }
+
+    fn bytes(&self) -> Result<u64, BagError> {
+        let metadata = self.file.metadata();
+        Ok(metadata
+            .map_err(|error| BagError::io(&self.path, error))?
+            .len())
+    }
+
+    fn information(&self) -> FileInformation {
+        let (first, last) = self.span_ns.unwrap_or((0, 0));
+        FileInformation {
+            path: self.name.clone(),
+            starting_time: StartingTime {
+                nanoseconds_since_epoch: first,
+            },
+            duration: Nanoseconds {
+                nanoseconds: last - first,
+            },
+            message_count: self.message_count,
+        }
+    }
+
+    /// Completes the file, waits until the disk has it, and gives its size.
+    fn finish(mut self, metadata: Option<&mcap::records::Metadata>) -> Result<u64, BagError> {
+        let path = self.path.clone();
+        let mcap = |error| BagError::mcap(&path, error);
+        if let Some(metadata) = metadata {
+            self.writer.write_metadata(metadata).map_err(mcap)?;
+        }
+        self.writer.finish().map_err(mcap)?;
+        let io = |error| BagError::io(&path, error);
+        self.writer.into_inner().flush().map_err(io)?;
+        self.file.sync_all().map_err(io)?;
+        Ok(self.file.metadata().map_err(io)?.len())
     }
 }
 

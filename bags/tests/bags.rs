@@ -126,7 +126,13 @@ fn a_topic_and_a_span_of_time_are_found_without_the_rest() {
 
 #[test]
 fn bags_of_another_program_are_read() {
-    for name in ["rosbags_plain", "rosbags_zstd"] {
+    for name in [
+        "rosbags_plain",
+        "rosbags_zstd",
+        "rosbags_sqlite",
+        "rosbags_sqlite_file",
+        "rosbags_sqlite_message",
+    ] {
         let bag = Path::new(env!("CARGO_MANIFEST_DIR"))
             .join("tests/data")
             .join(name);
@@ -145,6 +151,79 @@ fn bags_of_another_program_are_read() {
             (2, 3, [0, 1, 2, 3, 4, 5].as_slice())
         );
         assert_eq!(messages.len(), 6);
+        let hash = &reader.topics()[0].type_hash;
+        let expected = description("std_msgs/msg/String").unwrap().type_hash;
+        assert!(hash == expected || (hash.is_empty() && !name.contains("sqlite")));
+        // Topics and spans of time are found there as in bags of ours.
+        let (from, until) = (Duration::new(1, 2), Duration::new(1, 4));
+        let found = reader.messages_between(&["/chatter"], from, until);
+        let times: Vec<u32> = found
+            .map(|message| message.unwrap().log_time.subsec_nanos())
+            .collect();
+        assert_eq!(times, [2, 3], "{name}");
+        let folder = TempDir::new().unwrap();
+        let copy = folder.path().join("copy");
+        if name != "rosbags_sqlite_file" && name != "rosbags_sqlite_message" {
+            assert!(bags::verify(&bag).unwrap().whole, "{name}");
+            let recovery = bags::recover(&bag, &copy, Compression::None).unwrap();
+            assert_eq!((recovery.messages, recovery.complete), (6, true));
+        }
+    }
+}
+
+#[test]
+fn files_without_chunks_or_index_and_with_lz4_are_read() {
+    let folder = TempDir::new().unwrap();
+    let path = folder.path().join("other.mcap");
+    let options = || mcap::WriteOptions::new().profile("ros2");
+    for (options, indexed) in [
+        (options().use_chunks(false), false),
+        (options().compression(Some(mcap::Compression::Lz4)), true),
+        (
+            options()
+                .emit_chunk_indexes(false)
+                .emit_message_indexes(false)
+                .emit_statistics(false)
+                .repeat_channels(false)
+                .repeat_schemas(false)
+                .calculate_chunk_crcs(false)
+                // The mcap crate gets it wrong without checksums of the chunks.
+                .calculate_data_section_crc(false),
+            false,
+        ),
+    ] {
+        let file = std::io::BufWriter::new(std::fs::File::create(&path).unwrap());
+        let mut writer = options.create(file).unwrap();
+        let schema = writer
+            .add_schema("other_msgs/msg/Other", "ros2msg", b"uint8 a")
+            .unwrap();
+        let channel = writer
+            .add_channel(schema, "/other", "cdr", &Default::default())
+            .unwrap();
+        for time in 0..10u64 {
+            let header = mcap::records::MessageHeader {
+                channel_id: channel,
+                sequence: 0,
+                log_time: time,
+                publish_time: time,
+            };
+            writer
+                .write_to_known_channel(&header, &[0, 1, 0, 0, time as u8])
+                .unwrap();
+        }
+        writer.finish().unwrap();
+        drop(writer);
+        let reader = BagReader::open(&path).unwrap();
+        let last = |message: Result<RawMessage, BagError>| message.unwrap().data[4];
+        assert!(reader.messages().map(last).eq(0..10));
+        let (from, until) = (Duration::from_nanos(3), Duration::from_nanos(6));
+        let found = reader.messages_between(&["/other"], from, until);
+        assert!(found.map(last).eq(3..6), "indexed: {indexed}");
+        assert_eq!(
+            reader.messages().next().unwrap().unwrap().topic.type_name,
+            "other_msgs/msg/Other"
+        );
+        assert!(bags::verify(&path).unwrap().whole);
     }
 }
 
@@ -308,9 +387,9 @@ fn what_is_no_bag_says_why() {
     let refusal = |path: &Path| BagReader::open(path).err().unwrap().to_string();
     assert!(refusal(&bag).contains("run: No such file"));
     std::fs::create_dir(&bag).unwrap();
-    assert!(
-        refusal(&bag).ends_with("not a bag: metadata.yaml is missing, expected a finished bag")
-    );
+    assert!(refusal(&bag).ends_with(
+        "not a bag: metadata.yaml is missing, expected a finished bag; try sctn bag recover"
+    ));
     std::fs::write(bag.join("metadata.yaml"), "rosbag2_bagfile_information: 3").unwrap();
     assert!(refusal(&bag).contains("not a bag: metadata.yaml: "));
     let other = folder.path().join("other.mcap");

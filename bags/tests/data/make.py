@@ -18,12 +18,12 @@ HEADER = STORE.types["std_msgs/msg/Header"]
 TIME = STORE.types["builtin_interfaces/msg/Time"]
 
 
-def make(name, compression):
+def make(name, mode=None, plugin=StoragePlugin.MCAP):
     folder = HERE / name
     shutil.rmtree(folder, ignore_errors=True)
-    writer = Writer(folder, version=9, storage_plugin=StoragePlugin.MCAP)
-    if compression:
-        writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
+    writer = Writer(folder, version=9, storage_plugin=plugin)
+    if mode:
+        writer.set_compression(mode, CompressionFormat.ZSTD)
     with writer:
         texts = writer.add_connection("/chatter", STRING.__msgtype__, typestore=STORE)
         images = writer.add_connection("/image", IMAGE.__msgtype__, typestore=STORE)
@@ -35,5 +35,8 @@ def make(name, compression):
         writer.write(images, 1_000_000_005, STORE.serialize_cdr(image, IMAGE.__msgtype__))
 
 
-make("rosbags_plain", False)
-make("rosbags_zstd", True)
+make("rosbags_plain")
+make("rosbags_zstd", CompressionMode.STORAGE)
+make("rosbags_sqlite", plugin=StoragePlugin.SQLITE3)
+make("rosbags_sqlite_file", CompressionMode.FILE, StoragePlugin.SQLITE3)
+make("rosbags_sqlite_message", CompressionMode.MESSAGE, StoragePlugin.SQLITE3)

@@ -1,5 +1,6 @@
 //! The sctn command: launches the graph, makes demonstrations, trains, evaluates, draws.
 
+mod bag;
 mod bench;
 mod demos;
 mod evaluate;
@@ -14,6 +15,7 @@ use anyhow::Result;
 use clap::{Parser, Subcommand};
 use root::Root;
 use std::path::PathBuf;
+use std::process::ExitCode;
 
 #[derive(Parser)]
 #[command(name = "sctn", version, about, max_term_width = 100)]
@@ -27,6 +29,7 @@ struct Arguments {
 
 #[derive(Subcommand)]
 enum Command {
+    Bag(bag::Bag),
     /// Time the inner loops
     Bench(bench::Bench),
     /// Make demonstrations of a problem, and keep the successful ones as bags
@@ -41,16 +44,19 @@ enum Command {
     Picture(picture::Picture),
 }
 
-fn main() -> Result<()> {
+fn main() -> Result<ExitCode> {
     node_kit::logging::init(&[])?;
     let arguments = Arguments::parse();
-    let root = Root::find(arguments.root)?;
+    let root = || Root::find(arguments.root);
     match arguments.command {
-        Command::Bench(bench) => bench.run(&root),
-        Command::Demos(demos) => demos.run(&root),
-        Command::Train(train) => train.run(&root),
-        Command::Evaluate(evaluate) => evaluate.run(&root),
-        Command::Launch(launch) => launch.run(&root),
-        Command::Picture(picture) => picture.run(&root),
-    }
+        // Bags can be looked at anywhere.
+        Command::Bag(bag) => return bag.run(),
+        Command::Bench(bench) => bench.run(&root()?),
+        Command::Demos(demos) => demos.run(&root()?),
+        Command::Train(train) => train.run(&root()?),
+        Command::Evaluate(evaluate) => evaluate.run(&root()?),
+        Command::Launch(launch) => launch.run(&root()?),
+        Command::Picture(picture) => picture.run(&root()?),
+    }?;
+    Ok(ExitCode::SUCCESS)
 }

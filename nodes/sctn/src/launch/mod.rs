@@ -7,6 +7,7 @@ mod recorder;
 use crate::demos::demonstration;
 use crate::root::Root;
 use anyhow::{Context as _, Result, bail};
+use bags::outcome_name;
 use clap::Args;
 use graph::{Graph, Settings};
 use heightmap::Heightmap;
@@ -16,7 +17,7 @@ use multiravens::Environment;
 use node_kit::{
     Context, Network, Node, Parameters, Qos, RosArguments, ns_from_stamp, wait_for_end,
 };
-use operator::{Operator, OperatorKind, Question, automatic, outcome_name};
+use operator::{Operator, OperatorKind, Question, automatic};
 use recorder::Recorder;
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};

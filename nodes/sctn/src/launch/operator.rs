@@ -98,22 +98,6 @@ pub fn automatic(question: &Question) -> u8 {
     }
 }
 
-/// An outcome in words.
-pub fn outcome_name(outcome: u8) -> &'static str {
-    match outcome {
-        StepResult::PLACED => "placed",
-        StepResult::NO_CONTACT => "no contact",
-        StepResult::GRASP_FAILED => "grasp failed",
-        StepResult::DROPPED => "dropped",
-        StepResult::LAG_ABORTED => "stopped by lag",
-        StepResult::REFUSED => "refused",
-        StepResult::REJECTED => "rejected",
-        StepResult::FAULT => "fault",
-        StepResult::STOPPED => "stopped",
-        _ => "unknown outcome",
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;

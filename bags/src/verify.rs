@@ -1,0 +1,856 @@
+//! Is a bag whole? And what can be saved of one that is not.
+
+use crate::metadata::Metadata;
+use crate::reader::{parse_metadata, read_summary};
+use crate::scan::{self, Damage, Event, Records, Scan};
+use crate::sqlite::{Rows, Selection, SqliteFile};
+use crate::writer::{NOTES_RECORD, Stamps};
+use crate::{BagError, BagReader, BagWriter, Topic, TopicHandle, WriteOptions};
+use mcap::records::op;
+use serde::Serialize;
+use std::collections::BTreeMap;
+use std::fs::File;
+use std::io;
+use std::os::unix::fs::FileExt;
+use std::path::{Path, PathBuf};
+use std::time::Duration;
+
+/// Only so many findings are described, all are counted.
+const MAX_FINDINGS: usize = 1000;
+
+/// Something that is not as it should be.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize)]
+pub struct Finding {
+    /// The file's name.
+    pub file: String,
+    /// First byte, where the file's bytes are concerned.
+    pub offset: Option<u64>,
+    /// Number of bytes that cannot be used; 0 if none.
+    pub length: u64,
+    /// What is wrong, and what was expected.
+    pub reason: String,
+}
+
+/// Findings, the first of them described.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize)]
+pub struct Findings {
+    /// How many there are.
+    pub count: u64,
+    /// Bytes that cannot be used.
+    pub bytes: u64,
+    /// The first thousand.
+    pub first: Vec<Finding>,
+}
+
+impl Findings {
+    fn push(&mut self, finding: Finding) {
+        self.count += 1;
+        self.bytes += finding.length;
+        if self.first.len() < MAX_FINDINGS {
+            self.first.push(finding);
+        }
+    }
+
+    fn add(&mut self, file: &str, offset: Option<u64>, reason: String) {
+        self.push(Finding {
+            file: file.to_owned(),
+            offset,
+            length: 0,
+            reason,
+        });
+    }
+
+    fn add_damage(&mut self, file: &str, damage: Damage) {
+        self.push(Finding {
+            file: file.to_owned(),
+            offset: Some(damage.offset),
+            length: damage.length,
+            reason: damage.reason,
+        });
+    }
+}
+
+/// One file of a verified bag.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize)]
+pub struct VerifiedFile {
+    /// Its name.
+    pub name: String,
+    /// Its size.
+    pub bytes: u64,
+    /// Sound messages.
+    pub messages: u64,
+    /// Sound chunks.
+    pub chunks: u64,
+    /// Sound chunks that carry no checksum: damage of their data would go unnoticed.
+    pub unchecked_chunks: u64,
+    /// The largest chunk, uncompressed.
+    pub largest_chunk_bytes: u64,
+}
+
+/// One topic of a verified bag.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct VerifiedTopic {
+    /// Its name.
+    pub name: String,
+    /// Its type.
+    pub type_name: String,
+    /// Sound messages.
+    pub messages: u64,
+    /// Messages that the recorder's numbers say are missing; 0 also for recorders that count nothing.
+    pub missing: u64,
+    /// Longest time without a message between its first and its last [s].
+    pub longest_gap_s: f64,
+    /// When that began, since the clock's zero [s].
+    pub longest_gap_at_s: f64,
+}
+
+/// What [`verify`] found.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Verification {
+    /// The bag.
+    pub path: PathBuf,
+    /// No finding: every byte is as its writer meant it, as far as there are checksums.
+    pub whole: bool,
+    /// Its files.
+    pub files: Vec<VerifiedFile>,
+    /// Its topics, by name.
+    pub topics: Vec<VerifiedTopic>,
+    /// What is wrong.
+    pub findings: Findings,
+}
+
+/// What [`recover`] saved.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Recovery {
+    /// The repaired copy.
+    pub path: PathBuf,
+    /// Nothing had to be left out.
+    pub complete: bool,
+    /// Messages in the copy.
+    pub messages: u64,
+    /// Chunks whose messages are in the copy.
+    pub chunks: u64,
+    /// Messages of each topic in the copy.
+    pub topics: BTreeMap<String, u64>,
+    /// What was left out, and why.
+    pub lost: Findings,
+}
+
+/// Where the files of a bag are, also of one that was never finished.
+struct Found {
+    paths: Vec<PathBuf>,
+    metadata: Option<Metadata>,
+}
+
+fn find(path: &Path, findings: &mut Findings) -> Result<Found, BagError> {
+    let io = |error| BagError::io(path, error);
+    if !std::fs::metadata(path).map_err(io)?.is_dir() {
+        return Ok(Found {
+            paths: vec![path.to_owned()],
+            metadata: None,
+        });
+    }
+    let metadata = match parse_metadata(path) {
+        Ok(metadata) => Some(metadata),
+        Err(BagError::NotABag { reason, .. }) => {
+            findings.add("metadata.yaml", None, reason);
+            None
+        }
+        Err(error) => return Err(error),
+    };
+    let mut paths = Vec::new();
+    for entry in std::fs::read_dir(path).map_err(io)? {
+        let path = entry.map_err(io)?.path();
+        if path
+            .extension()
+            .is_some_and(|extension| extension == "mcap" || extension == "db3")
+        {
+            paths.push(path);
+        }
+    }
+    // NAME_2 before NAME_10.
+    paths.sort_by_key(|path| (path.as_os_str().len(), path.clone()));
+    for listed in metadata.iter().flat_map(|found| &found.relative_file_paths) {
+        let name = Path::new(listed).file_name();
+        if !paths.iter().any(|path| path.file_name() == name) {
+            let reason = if listed.ends_with(".zstd") {
+                format!("{listed} is compressed as a whole: uncompress it with zstd -d first")
+            } else {
+                format!("{listed} is listed and not there")
+            };
+            findings.add("metadata.yaml", None, reason);
+        }
+    }
+    if paths.is_empty() {
+        return Err(BagError::NotABag {
+            path: path.to_owned(),
+            reason: "it holds no .mcap and no .db3 file".into(),
+        });
+    }
+    Ok(Found { paths, metadata })
+}
+
+fn name_of(path: &Path) -> String {
+    path.file_name()
+        .unwrap_or_default()
+        .to_string_lossy()
+        .into_owned()
+}
+
+fn is_sqlite(path: &Path) -> bool {
+    path.extension().is_some_and(|extension| extension == "db3")
+}
+
+/// What is known of the channels of a file.
+#[derive(Default)]
+struct Channels {
+    schemas: BTreeMap<u16, mcap::Schema<'static>>,
+    channels: BTreeMap<u16, Topic>,
+}
+
+impl Channels {
+    /// Takes up a schema or channel record; anything else is passed over. An error if it is malformed or contradicts
+    /// an earlier one.
+    fn record(&mut self, opcode: u8, body: &[u8]) -> Result<(), String> {
+        match opcode {
+            op::SCHEMA => {
+                let (id, name, encoding, data) =
+                    scan::schema(body).ok_or("a schema that is none")?;
+                let schema = mcap::Schema {
+                    id,
+                    name,
+                    encoding,
+                    data: data.into(),
+                };
+                match self.schemas.get(&id) {
+                    Some(known) if *known != schema => {
+                        return Err(format!("schema {id} is defined twice, differently"));
+                    }
+                    _ => self.schemas.insert(id, schema),
+                };
+            }
+            op::CHANNEL => {
+                let channel = scan::channel(body).ok_or("a channel that is none")?;
+                let schema = self.schemas.get(&channel.schema_id).cloned();
+                if schema.is_none() && channel.schema_id != 0 {
+                    return Err(format!(
+                        "channel {} of topic {} has the unknown schema {}",
+                        channel.id, channel.topic, channel.schema_id
+                    ));
+                }
+                let id = channel.id;
+                let topic = Topic::of(
+                    &mcap::Channel {
+                        id,
+                        topic: channel.topic,
+                        schema: schema.map(Into::into),
+                        message_encoding: channel.message_encoding,
+                        metadata: channel.metadata,
+                    },
+                    0,
+                );
+                match self.channels.get(&id) {
+                    Some(known) if *known != topic => {
+                        return Err(format!("channel {id} is defined twice, differently"));
+                    }
+                    _ => self.channels.insert(id, topic),
+                };
+            }
+            _ => {}
+        }
+        Ok(())
+    }
+
+    fn of_summary(summary: &mcap::Summary) -> Self {
+        let schemas = summary.schemas.iter();
+        let channels = summary.channels.iter();
+        Self {
+            schemas: schemas
+                .map(|(id, schema)| (*id, mcap::Schema::clone(schema)))
+                .collect(),
+            channels: channels
+                .map(|(id, channel)| (*id, Topic::of(channel, 0)))
+                .collect(),
+        }
+    }
+}
+
+/// Looks at every byte of a bag: framing, checksums, indices, counts, and the times of its messages. An error only if
+/// it cannot be read at all.
+pub fn verify(path: &Path) -> Result<Verification, BagError> {
+    let mut findings = Findings::default();
+    let found = find(path, &mut findings)?;
+    let mut topics = Topics::default();
+    let mut files = Vec::new();
+    for path in &found.paths {
+        let file = if is_sqlite(path) {
+            verify_sqlite(path, &mut findings, &mut topics)?
+        } else {
+            verify_mcap(path, &mut findings, &mut topics)?
+        };
+        files.push(file);
+    }
+    if let Some(metadata) = &found.metadata {
+        compare_metadata(metadata, &files, &topics, &mut findings);
+    }
+    Ok(Verification {
+        path: path.to_owned(),
+        whole: findings.count == 0,
+        files,
+        topics: topics.0.into_iter().map(Progress::finish).collect(),
+        findings,
+    })
+}
+
+fn compare_metadata(
+    metadata: &Metadata,
+    files: &[VerifiedFile],
+    topics: &Topics,
+    findings: &mut Findings,
+) {
+    let mut differ = |what: &str, said: u64, found: u64| {
+        if said != found {
+            let reason = format!("it says {said} messages {what}, the files hold {found}");
+            findings.add("metadata.yaml", None, reason);
+        }
+    };
+    let total = files.iter().map(|file| file.messages).sum();
+    differ("in all", metadata.message_count, total);
+    for topic in &metadata.topics_with_message_count {
+        let name = &topic.topic_metadata.name;
+        let found = topics.0.get(name).map_or(0, |topic| topic.messages);
+        differ(&format!("on {name}"), topic.message_count, found);
+    }
+}
+
+/// Topics by name while messages pass.
+#[derive(Default)]
+struct Topics(BTreeMap<String, Progress>);
+
+#[derive(Default)]
+struct Progress {
+    type_name: String,
+    messages: u64,
+    missing: u64,
+    last: Option<(u32, u64)>,
+    gap: (u64, u64),
+}
+
+impl Topics {
+    fn message(&mut self, topic: &Topic, sequence: u32, log_time: u64) {
+        let progress = match self.0.get_mut(&topic.name) {
+            Some(progress) => progress,
+            None => self.0.entry(topic.name.clone()).or_default(),
+        };
+        progress.type_name.clone_from(&topic.type_name);
+        progress.messages += 1;
+        if let Some((number, time)) = progress.last {
+            if sequence > number {
+                progress.missing += u64::from(sequence - number - 1);
+            }
+            let gap = log_time.saturating_sub(time);
+            if gap > progress.gap.0 {
+                progress.gap = (gap, time);
+            }
+        }
+        progress.last = Some((sequence, log_time));
+    }
+}
+
+impl Progress {
+    fn finish((name, progress): (String, Self)) -> VerifiedTopic {
+        VerifiedTopic {
+            name,
+            type_name: progress.type_name,
+            messages: progress.messages,
+            missing: progress.missing,
+            longest_gap_s: Duration::from_nanos(progress.gap.0).as_secs_f64(),
+            longest_gap_at_s: Duration::from_nanos(progress.gap.1).as_secs_f64(),
+        }
+    }
+}
+
+fn verify_sqlite(
+    path: &Path,
+    findings: &mut Findings,
+    topics: &mut Topics,
+) -> Result<VerifiedFile, BagError> {
+    let name = name_of(path);
+    let mut verified = VerifiedFile {
+        bytes: std::fs::metadata(path)
+            .map_err(|error| BagError::io(path, error))?
+            .len(),
+        name: name.clone(),
+        ..VerifiedFile::default()
+    };
+    let mut read = || -> Result<(), BagError> {
+        let file = SqliteFile::open(path.to_owned())?;
+        for line in file.integrity()? {
+            findings.add(&name, None, line);
+        }
+        let mut rows = Rows::new(Selection::File);
+        while let Some(message) = rows.next(&file)? {
+            verified.messages += 1;
+            topics.message(&message.topic, 0, message.time.as_nanos() as u64);
+        }
+        Ok(())
+    };
+    match read() {
+        Err(error @ (BagError::Damaged { .. } | BagError::NotABag { .. })) => {
+            findings.add(&name, None, error.to_string());
+        }
+        other => other?,
+    }
+    Ok(verified)
+}
+
+/// A chunk as it was found.
+struct SeenChunk {
+    offset: u64,
+    length: u64,
+    start: u64,
+    end: u64,
+}
+
+/// Everything that the end of a file repeats about its data, for comparison.
+#[derive(Default)]
+struct Tally {
+    chunks: Vec<SeenChunk>,
+    messages: u64,
+    channel_messages: BTreeMap<u16, u64>,
+    span: Option<(u64, u64)>,
+    /// Messages of the last chunk: channel, log times and offsets.
+    last_chunk: BTreeMap<u16, Vec<(u64, u64)>>,
+    data_ended: bool,
+    damaged: bool,
+}
+
+impl Tally {
+    fn message(&mut self, header: &mcap::records::MessageHeader) {
+        let time = header.log_time;
+        let (first, last) = self.span.unwrap_or((time, time));
+        self.span = Some((first.min(time), last.max(time)));
+        self.messages += 1;
+        *self.channel_messages.entry(header.channel_id).or_default() += 1;
+    }
+}
+
+fn verify_mcap(
+    path: &Path,
+    findings: &mut Findings,
+    topics: &mut Topics,
+) -> Result<VerifiedFile, BagError> {
+    let io = |error| BagError::io(path, error);
+    let name = name_of(path);
+    let summary = read_summary(path);
+    let hints = summary.as_ref().map_or_else(|_| Vec::new(), chunk_offsets);
+    if let Err(error) = &summary {
+        findings.add(&name, None, error.to_string());
+    }
+    let hashed = File::open(path).map_err(io)?;
+    let mut crc = RunningCrc::new(&hashed);
+    let mut scan = Scan::new(File::open(path).map_err(io)?, hints).map_err(io)?;
+    let mut verified = VerifiedFile {
+        name: name.clone(),
+        bytes: scan.size(),
+        ..VerifiedFile::default()
+    };
+    let mut channels = Channels::default();
+    let mut tally = Tally::default();
+    let mut footer = None;
+    while let Some(event) = scan.next().map_err(io)? {
+        match event {
+            Event::Damage(damage) => {
+                tally.damaged = true;
+                findings.add_damage(&name, damage);
+            }
+            Event::Chunk {
+                offset,
+                length,
+                header,
+                records,
+            } => {
+                verified.chunks += 1;
+                verified.unchecked_chunks += u64::from(header.uncompressed_crc == 0);
+                verified.largest_chunk_bytes =
+                    verified.largest_chunk_bytes.max(header.uncompressed_size);
+                tally.last_chunk.clear();
+                tally.chunks.push(SeenChunk {
+                    offset,
+                    length,
+                    start: header.message_start_time,
+                    end: header.message_end_time,
+                });
+                for record in Records::new(records).flatten() {
+                    let (within, opcode, body) = record;
+                    if opcode != op::MESSAGE {
+                        if let Err(reason) = channels.record(opcode, body) {
+                            findings.add(&name, Some(offset), reason);
+                        }
+                        continue;
+                    }
+                    if let Some((header, _)) = scan::message(body) {
+                        let index = tally.last_chunk.entry(header.channel_id).or_default();
+                        index.push((header.log_time, within));
+                        tally.message(&header);
+                        match channels.channels.get(&header.channel_id) {
+                            Some(topic) => topics.message(topic, header.sequence, header.log_time),
+                            None => findings.add(&name, Some(offset), unknown_channel(&header)),
+                        }
+                        verified.messages += 1;
+                    }
+                }
+            }
+            Event::Record {
+                offset,
+                opcode,
+                body,
+            } => match opcode {
+                op::SCHEMA | op::CHANNEL => {
+                    if let Err(reason) = channels.record(opcode, body) {
+                        findings.add(&name, Some(offset), reason);
+                    }
+                }
+                op::MESSAGE => {
+                    if let Some((header, _)) = scan::message(body) {
+                        tally.message(&header);
+                        match channels.channels.get(&header.channel_id) {
+                            Some(topic) => topics.message(topic, header.sequence, header.log_time),
+                            None => findings.add(&name, Some(offset), unknown_channel(&header)),
+                        }
+                        verified.messages += 1;
+                    }
+                }
+                op::MESSAGE_INDEX => {
+                    let fits = scan::message_index(body).is_some_and(|(id, mut entries)| {
+                        entries.sort_unstable();
+                        let found = tally.last_chunk.get_mut(&id);
+                        found.map_or(entries.is_empty(), |found| {
+                            found.sort_unstable();
+                            *found == entries
+                        })
+                    });
+                    if !fits && !tally.damaged {
+                        let reason = "an index of messages that does not fit its chunk";
+                        findings.add(&name, Some(offset), reason.into());
+                    }
+                }
+                op::DATA_END => {
+                    tally.data_ended = true;
+                    let expected = scan::data_end(body).unwrap_or(0);
+                    let actual = crc.up_to(offset).map_err(io)?;
+                    if expected != 0 && expected != actual {
+                        let reason = "the checksum of the data does not fit";
+                        findings.add(&name, Some(offset), reason.into());
+                    }
+                }
+                op::FOOTER => {
+                    if let Ok(mcap::records::Record::Footer(found)) =
+                        mcap::parse_record(opcode, body)
+                    {
+                        footer = Some((offset, found));
+                    }
+                }
+                // Their contents are compared below; here that they can be read.
+                _ if opcode < 0x80 => {
+                    if let Err(error) = mcap::parse_record(opcode, body) {
+                        findings.add(&name, Some(offset), error.to_string());
+                    }
+                }
+                _ => {}
+            },
+        }
+        if !tally.data_ended {
+            let position = scan.position();
+            crc.up_to(position).map_err(io)?;
+        }
+    }
+    match footer {
+        Some((offset, footer)) => {
+            let start = footer.summary_start;
+            if footer.summary_crc != 0 && start != 0 && start <= offset {
+                let mut crc = RunningCrc::new(&hashed);
+                crc.position = start;
+                // The footer's own fields up to the checksum count too.
+                let actual = crc.up_to(offset + 9 + 16).map_err(io)?;
+                if actual != footer.summary_crc {
+                    let reason = "the checksum of the summary does not fit";
+                    findings.add(&name, Some(start), reason.into());
+                }
+            }
+        }
+        None if summary.is_ok() => findings.add(&name, None, "it has no footer".into()),
+        None => {}
+    }
+    if !tally.data_ended {
+        let reason = "its data has no end: its writer stopped half-way, or it was cut";
+        findings.add(&name, None, reason.into());
+    }
+    if let Ok(summary) = &summary {
+        compare_summary(&name, summary, &tally, findings);
+    }
+    Ok(verified)
+}
+
+fn unknown_channel(header: &mcap::records::MessageHeader) -> String {
+    format!("a message of the unknown channel {}", header.channel_id)
+}
+
+fn compare_summary(name: &str, summary: &mcap::Summary, tally: &Tally, findings: &mut Findings) {
+    if let Some(stats) = &summary.stats {
+        let mut differ = |what: &str, said: u64, found: u64| {
+            if said != found {
+                let reason = format!("its summary says {said} {what}, it holds {found}");
+                findings.add(name, None, reason);
+            }
+        };
+        differ("messages", stats.message_count, tally.messages);
+        differ(
+            "chunks",
+            stats.chunk_count.into(),
+            tally.chunks.len() as u64,
+        );
+        for (channel, said) in &stats.channel_message_counts {
+            let found = tally.channel_messages.get(channel).copied().unwrap_or(0);
+            differ(&format!("messages of channel {channel}"), *said, found);
+        }
+        if let Some((first, last)) = tally.span {
+            differ("ns as the first log time", stats.message_start_time, first);
+            differ("ns as the last log time", stats.message_end_time, last);
+        }
+    }
+    if summary.chunk_indexes.is_empty() {
+        return;
+    }
+    let indexed: BTreeMap<u64, &mcap::records::ChunkIndex> = summary
+        .chunk_indexes
+        .iter()
+        .map(|index| (index.chunk_start_offset, index))
+        .collect();
+    for chunk in &tally.chunks {
+        let fits = indexed.get(&chunk.offset).is_some_and(|index| {
+            (
+                index.chunk_length,
+                index.message_start_time,
+                index.message_end_time,
+            ) == (chunk.length, chunk.start, chunk.end)
+        });
+        if !fits {
+            let reason = "a chunk that the index does not name as it is";
+            findings.add(name, Some(chunk.offset), reason.into());
+        }
+    }
+    let seen: Vec<u64> = tally.chunks.iter().map(|chunk| chunk.offset).collect();
+    for offset in indexed.keys() {
+        if seen.binary_search(offset).is_err() && !tally.damaged {
+            let reason = "the index names a chunk that is not there";
+            findings.add(name, Some(*offset), reason.into());
+        }
+    }
+}
+
+fn chunk_offsets(summary: &mcap::Summary) -> Vec<u64> {
+    let indexes = summary.chunk_indexes.iter();
+    indexes.map(|index| index.chunk_start_offset).collect()
+}
+
+/// The checksum of a file from one byte to another.
+struct RunningCrc<'a> {
+    file: &'a File,
+    position: u64,
+    hasher: crc32fast::Hasher,
+    buffer: Vec<u8>,
+}
+
+impl<'a> RunningCrc<'a> {
+    fn new(file: &'a File) -> Self {
+        Self {
+            file,
+            position: 0,
+            hasher: crc32fast::Hasher::new(),
+            buffer: vec![0; 1 << 16],
+        }
+    }
+
+    fn up_to(&mut self, end: u64) -> io::Result<u32> {
+        while self.position < end {
+            let count = self.buffer.len().min((end - self.position) as usize);
+            let buffer = &mut self.buffer[..count];
+            self.file.read_exact_at(buffer, self.position)?;
+            self.hasher.update(buffer);
+            self.position += count as u64;
+        }
+        Ok(self.hasher.clone().finalize())
+    }
+}
+
+/// Writes a repaired copy of a bag, finished or not: the messages of all chunks whose checksums fit, in their order. In
+/// files without chunks every message whose framing is sound counts. The copy is a bag of its own; the original stays as it is.
+pub fn recover(
+    source: &Path,
+    copy: &Path,
+    options: impl Into<WriteOptions>,
+) -> Result<Recovery, BagError> {
+    let mut lost = Findings::default();
+    let found = find(source, &mut lost)?;
+    BagWriter::discard_partial(copy)?;
+    let mut copied = Copied {
+        bag: BagWriter::create(copy, options)?,
+        topics: BTreeMap::new(),
+        counts: BTreeMap::new(),
+        chunks: 0,
+    };
+    let notes = found.metadata.and_then(|metadata| metadata.custom_data);
+    for (key, value) in notes.into_iter().flatten() {
+        copied.bag.note(&key, value);
+    }
+    for path in &found.paths {
+        if is_sqlite(path) {
+            copied.sqlite(path, &mut lost)?;
+        } else {
+            copied.mcap(path, &mut lost)?;
+        }
+    }
+    let messages = copied.bag.message_count();
+    copied.bag.finish()?;
+    Ok(Recovery {
+        path: copy.to_owned(),
+        complete: lost.count == 0,
+        messages,
+        chunks: copied.chunks,
+        topics: copied.counts,
+        lost,
+    })
+}
+
+/// A copy that is being made.
+struct Copied {
+    bag: BagWriter,
+    topics: BTreeMap<String, TopicHandle>,
+    counts: BTreeMap<String, u64>,
+    chunks: u64,
+}
+
+impl Copied {
+    fn write(&mut self, topic: &Topic, stamps: Stamps, data: &[u8]) -> Result<(), BagError> {
+        let handle = match self.topics.get(&topic.name) {
+            Some(handle) => *handle,
+            None => {
+                let handle = self.bag.add_topic_of(topic)?;
+                self.topics.insert(topic.name.clone(), handle);
+                self.counts.insert(topic.name.clone(), 0);
+                handle
+            }
+        };
+        self.bag.write_stamped(handle, stamps, data)?;
+        if let Some(count) = self.counts.get_mut(&topic.name) {
+            *count += 1;
+        }
+        Ok(())
+    }
+
+    fn sqlite(&mut self, path: &Path, lost: &mut Findings) -> Result<(), BagError> {
+        let reader = match BagReader::open(path) {
+            Ok(reader) => reader,
+            Err(error @ (BagError::Damaged { .. } | BagError::NotABag { .. })) => {
+                lost.add(&name_of(path), None, error.to_string());
+                return Ok(());
+            }
+            Err(error) => return Err(error),
+        };
+        for message in reader.messages() {
+            match message {
+                Ok(message) => {
+                    let stamps = Stamps {
+                        sequence: message.sequence,
+                        log_time: message.log_time,
+                        publish_time: message.publish_time,
+                    };
+                    self.write(&message.topic, stamps, &message.data)?;
+                }
+                Err(error) => lost.add(&name_of(path), None, error.to_string()),
+            }
+        }
+        Ok(())
+    }
+
+    fn mcap(&mut self, path: &Path, lost: &mut Findings) -> Result<(), BagError> {
+        let io = |error| BagError::io(path, error);
+        let name = name_of(path);
+        let summary = read_summary(path).ok();
+        let hints = summary.as_ref().map_or_else(Vec::new, chunk_offsets);
+        let mut channels = summary.as_ref().map(Channels::of_summary);
+        let channels = channels.get_or_insert_default();
+        for topic in channels.channels.values() {
+            // Also those without messages; two of one name and different types come to light with their messages.
+            if let Ok(handle) = self.bag.add_topic_of(topic) {
+                self.topics.insert(topic.name.clone(), handle);
+                self.counts.entry(topic.name.clone()).or_default();
+            }
+        }
+        let mut scan = Scan::new(File::open(path).map_err(io)?, hints).map_err(io)?;
+        let mut orphans: BTreeMap<u16, u64> = BTreeMap::new();
+        let mut ended = false;
+        let mut message = |copied: &mut Self, channels: &Channels, body: &[u8]| {
+            let Some((header, data)) = scan::message(body) else {
+                return Ok(());
+            };
+            let Some(topic) = channels.channels.get(&header.channel_id) else {
+                *orphans.entry(header.channel_id).or_default() += 1;
+                return Ok(());
+            };
+            let stamps = Stamps {
+                sequence: header.sequence,
+                log_time: Duration::from_nanos(header.log_time),
+                publish_time: Duration::from_nanos(header.publish_time),
+            };
+            copied.write(topic, stamps, data)
+        };
+        while let Some(event) = scan.next().map_err(io)? {
+            match event {
+                Event::Damage(damage) => lost.add_damage(&name, damage),
+                Event::Chunk {
+                    offset, records, ..
+                } => {
+                    self.chunks += 1;
+                    for (_, opcode, body) in Records::new(records).flatten() {
+                        if opcode == op::MESSAGE {
+                            message(self, channels, body)?;
+                        } else if let Err(reason) = channels.record(opcode, body) {
+                            lost.add(&name, Some(offset), reason);
+                        }
+                    }
+                }
+                Event::Record {
+                    offset,
+                    opcode,
+                    body,
+                } => match opcode {
+                    op::MESSAGE => message(self, channels, body)?,
+                    op::SCHEMA | op::CHANNEL => {
+                        if let Err(reason) = channels.record(opcode, body) {
+                            lost.add(&name, Some(offset), reason);
+                        }
+                    }
+                    op::METADATA => {
+                        let notes = scan::metadata(body).filter(|(name, _)| name == NOTES_RECORD);
+                        for (key, value) in notes.into_iter().flat_map(|(_, entries)| entries) {
+                            self.bag.note(&key, value);
+                        }
+                    }
+                    op::DATA_END => ended = true,
+                    _ => {}
+                },
+            }
+        }
+        if !ended {
+            let reason = "its data has no end: its writer stopped half-way, or it was cut";
+            lost.add(&name, None, reason.into());
+        }
+        for (channel, count) in orphans {
+            let reason = format!("{count} messages of the unknown channel {channel}");
+            lost.add(&name, None, reason);
+        }
+        Ok(())
+    }
+}

@@ -17,7 +17,7 @@ fn networks(criterion: &mut Criterion) {
     let (observation, goal) = (heightmap(1), heightmap(2));
     let sample = Sample {
         observation: &observation,
-        goal: &goal,
+        goal: (&goal).into(),
         pick: Isometry2::new(Vector2::new(0.5, 0.1), 0.0),
         place: Isometry2::new(Vector2::new(0.4, -0.2), 1.0),
     };

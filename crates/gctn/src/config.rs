@@ -53,6 +53,18 @@ pub enum GoalConditioning {
     NextStep,
     /// The last observation of the demonstration (GCTN).
     Final,
+    /// Both, in this order.
+    Both,
+}
+
+impl GoalConditioning {
+    /// How many images that is.
+    pub(crate) const fn images(self) -> usize {
+        match self {
+            Self::NextStep | Self::Final => 1,
+            Self::Both => 2,
+        }
+    }
 }
 
 /// The networks to choose from.
@@ -63,6 +75,8 @@ pub enum Network {
     Resnet43(Resnet43),
     /// One shared U-Net with three small heads.
     Compact(Compact),
+    /// One shared GR-ConvNet with the same three heads.
+    GrConvnet(GrConvnet),
 }
 
 /// The published Goal-Conditioned Transporter Network (Seita et al., ICRA 2021; paper, section III-B).
@@ -99,6 +113,8 @@ pub struct Compact {
     pub feature_channels: usize,
     /// Edge length of the query window round the pick, in cells of stride 2. Odd.
     pub window_cells: usize,
+    /// How the query window is rotated.
+    pub rotation_sampling: Interpolation,
 }
 
 impl Default for Compact {
@@ -108,6 +124,36 @@ impl Default for Compact {
             blocks: [1, 1, 1, 2],
             feature_channels: 8,
             window_cells: 25,
+            rotation_sampling: Interpolation::Bilinear,
+        }
+    }
+}
+
+/// A trunk after GR-ConvNet (Kumra, Joshi and Sahin, IROS 2020): convolutions down to stride 8, residual blocks there, and up again
+/// without skips. Without batch norm, and its input and output are at half resolution.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct GrConvnet {
+    /// Channels at stride 2; twice as many at 4, four times at 8.
+    pub channels: usize,
+    /// Residual blocks at stride 8.
+    pub blocks: usize,
+    /// Query and key feature channels.
+    pub feature_channels: usize,
+    /// Edge length of the query window round the pick, in cells of stride 2. Odd.
+    pub window_cells: usize,
+    /// How the query window is rotated.
+    pub rotation_sampling: Interpolation,
+}
+
+impl Default for GrConvnet {
+    fn default() -> Self {
+        Self {
+            channels: 32,
+            blocks: 5,
+            feature_channels: 8,
+            window_cells: 25,
+            rotation_sampling: Interpolation::Bilinear,
         }
     }
 }
@@ -174,6 +220,17 @@ impl NetworkConfig {
         let good = (1..=360).contains(&self.rotations);
         check("rotations", good, self.rotations, "1 to 360")?;
         let channels = |channels: &usize| (1..=1024).contains(channels);
+        let heads = |features: usize, window_cells: usize| {
+            check(
+                "feature_channels",
+                channels(&features),
+                features,
+                "1 to 1024",
+            )?;
+            let good = (3..=255).contains(&window_cells) && window_cells % 2 == 1;
+            let expected = "an odd number from 3 to 255";
+            check("window_cells", good, window_cells, expected)
+        };
         match &self.network {
             Network::Resnet43(Resnet43 {
                 crop_px,
@@ -192,21 +249,20 @@ impl NetworkConfig {
                 let good = compact.blocks.iter().all(|blocks| *blocks <= 16);
                 let actual = format!("{:?}", compact.blocks);
                 check("blocks", good, actual, "0 to 16 each")?;
-                let good = channels(&compact.feature_channels);
+                heads(compact.feature_channels, compact.window_cells)
+            }
+            Network::GrConvnet(gr_convnet) => {
+                let GrConvnet {
+                    channels, blocks, ..
+                } = *gr_convnet;
                 check(
-                    "feature_channels",
-                    good,
-                    compact.feature_channels,
-                    "1 to 1024",
+                    "channels",
+                    (1..=256).contains(&channels),
+                    channels,
+                    "1 to 256",
                 )?;
-                let window_cells = compact.window_cells;
-                let good = (3..=255).contains(&window_cells) && window_cells % 2 == 1;
-                check(
-                    "window_cells",
-                    good,
-                    window_cells,
-                    "an odd number from 3 to 255",
-                )
+                check("blocks", blocks <= 16, blocks, "0 to 16")?;
+                heads(gr_convnet.feature_channels, gr_convnet.window_cells)
             }
         }
     }

@@ -31,6 +31,18 @@ pub enum Error {
         /// What is wrong with it.
         source: heightmap::HeightmapError,
     },
+    /// Goals that are not those that the network is conditioned on.
+    #[error(
+        "{actual} goal images, but the network is conditioned on {conditioning:?}: expected {expected}"
+    )]
+    Goals {
+        /// What it is conditioned on.
+        conditioning: crate::GoalConditioning,
+        /// Images given.
+        actual: usize,
+        /// Images expected.
+        expected: usize,
+    },
     /// A training label off the heightmap, or not finite.
     #[error(
         "sample {index}: the {what} pose ({x_m} m, {y_m} m, {yaw_rad} rad) is not on the heightmap"

@@ -5,55 +5,70 @@ use nalgebra::{Isometry2, Point2, Vector3};
 use tch::Tensor;
 
 use crate::augment::Warp;
-use crate::{Error, Interpolation, NetworkConfig, Sample};
+use crate::{Error, Goal, Interpolation, NetworkConfig, Sample};
 
 /// Colour (0..255) and height (m) of a cell.
 type Cell = [f32; 4];
 
-/// What a network reads of each cell.
+/// What a network reads of each cell: of the observation, then of each goal.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Encoding {
-    /// RGB in 0..255 and height in metres of the observation, then of the goal.
+pub(crate) struct Encoding {
+    pub reading: Reading,
+    /// Number of goal images.
+    pub goals: usize,
+}
+
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Reading {
+    /// RGB in 0..255 and height in metres.
     Raw,
-    /// RGB and height of observation and goal, scaled; their differences; mean absolute colour difference;
-    /// absolute height difference.
+    /// RGB and height, scaled. With each goal its difference from the observation, the mean absolute colour
+    /// difference and the absolute height difference.
     Difference,
+}
+
+impl Reading {
+    /// Channels of the observation, and of each goal.
+    const fn channels(self) -> [usize; 2] {
+        match self {
+            Self::Raw => [4, 4],
+            Self::Difference => [4, 10],
+        }
+    }
+
+    #[inline(always)]
+    fn write(self, observation: Cell, goals: impl Iterator<Item = Cell>, out: &mut [f32]) {
+        // Heights of 40 mm, the edge of a block, count as much as half the range of a colour.
+        let scaled = |cell: Cell| -> Cell {
+            std::array::from_fn(|i| match (self, i) {
+                (Self::Raw, _) => cell[i],
+                (Self::Difference, 3) => cell[3] * (1.0 / 0.04),
+                (Self::Difference, _) => cell[i] * (1.0 / 128.0) - 1.1,
+            })
+        };
+        let [own, each] = self.channels();
+        let (first, rest) = out.split_at_mut(own);
+        let observation = scaled(observation);
+        first.copy_from_slice(&observation);
+        for (goal, out) in goals.zip(rest.chunks_exact_mut(each)) {
+            let goal = scaled(goal);
+            out[..4].copy_from_slice(&goal);
+            if self == Self::Difference {
+                let difference: Cell = std::array::from_fn(|i| goal[i] - observation[i]);
+                out[4..8].copy_from_slice(&difference);
+                let colour = difference[0].abs() + difference[1].abs() + difference[2].abs();
+                out[8] = colour * (1.0 / 3.0);
+                out[9] = difference[3].abs();
+            }
+        }
+    }
 }
 
 impl Encoding {
     /// Number of channels.
     pub const fn channels(self) -> usize {
-        match self {
-            Self::Raw => 8,
-            Self::Difference => 14,
-        }
-    }
-
-    #[inline(always)]
-    fn write(self, observation: Cell, goal: Cell, out: &mut [f32]) {
-        match self {
-            Self::Raw => {
-                out[..4].copy_from_slice(&observation);
-                out[4..8].copy_from_slice(&goal);
-            }
-            Self::Difference => {
-                // Heights of 40 mm, the edge of a block, count as much as half the range of a colour.
-                let scaled = |cell: Cell| -> Cell {
-                    std::array::from_fn(|i| match i {
-                        3 => cell[3] * (1.0 / 0.04),
-                        _ => cell[i] * (1.0 / 128.0) - 1.1,
-                    })
-                };
-                let (observation, goal) = (scaled(observation), scaled(goal));
-                let difference: Cell = std::array::from_fn(|i| goal[i] - observation[i]);
-                out[..4].copy_from_slice(&observation);
-                out[4..8].copy_from_slice(&goal);
-                out[8..12].copy_from_slice(&difference);
-                let colour = difference[0].abs() + difference[1].abs() + difference[2].abs();
-                out[12] = colour * (1.0 / 3.0);
-                out[13] = difference[3].abs();
-            }
-        }
+        let [own, each] = self.reading.channels();
+        own + each * self.goals
     }
 }
 
@@ -112,69 +127,52 @@ impl<'a> Image<'a> {
     }
 }
 
-/// Writes what a network reads, cell after cell, rows first, into `out`.
+/// Writes what a network reads, cell after cell, rows first, into `out`. There are as many goals as the
+/// encoding says.
 pub(crate) fn encode(
     encoding: Encoding,
     observation: &Heightmap,
-    goal: &Heightmap,
+    goal: Goal<'_>,
     warp: &Warp,
     out: &mut [f32],
 ) {
-    match (encoding, warp.interpolation) {
-        // Constants, so that the inner loop has no branches.
-        (Encoding::Raw, Interpolation::Nearest) => {
-            encode_as(
-                Encoding::Raw,
-                Interpolation::Nearest,
-                observation,
-                goal,
-                warp,
-                out,
-            );
+    let observation = Image::new(observation);
+    match (goal.last, encoding.goals) {
+        (Some(last), 2) => {
+            let goals = [goal.image, last].map(Image::new);
+            encode_goals(encoding, &observation, goals, warp, out);
         }
-        (Encoding::Raw, Interpolation::Bilinear) => {
-            encode_as(
-                Encoding::Raw,
-                Interpolation::Bilinear,
-                observation,
-                goal,
-                warp,
-                out,
-            );
-        }
-        (Encoding::Difference, Interpolation::Nearest) => {
-            encode_as(
-                Encoding::Difference,
-                Interpolation::Nearest,
-                observation,
-                goal,
-                warp,
-                out,
-            );
-        }
-        (Encoding::Difference, Interpolation::Bilinear) => {
-            encode_as(
-                Encoding::Difference,
-                Interpolation::Bilinear,
-                observation,
-                goal,
-                warp,
-                out,
-            );
-        }
+        _ => encode_goals(encoding, &observation, [Image::new(goal.image)], warp, out),
+    }
+}
+
+fn encode_goals<const GOALS: usize>(
+    encoding: Encoding,
+    observation: &Image<'_>,
+    goals: [Image<'_>; GOALS],
+    warp: &Warp,
+    out: &mut [f32],
+) {
+    use Interpolation::{Bilinear, Nearest};
+    use Reading::{Difference, Raw};
+    // Constants, so that the inner loop has no branches.
+    match (encoding.reading, warp.interpolation) {
+        (Raw, Nearest) => encode_as(Raw, Nearest, observation, goals, warp, out),
+        (Raw, Bilinear) => encode_as(Raw, Bilinear, observation, goals, warp, out),
+        (Difference, Nearest) => encode_as(Difference, Nearest, observation, goals, warp, out),
+        (Difference, Bilinear) => encode_as(Difference, Bilinear, observation, goals, warp, out),
     }
 }
 
 #[inline(always)]
-fn encode_as(
-    encoding: Encoding,
+fn encode_as<const GOALS: usize>(
+    reading: Reading,
     interpolation: Interpolation,
-    observation: &Heightmap,
-    goal: &Heightmap,
+    observation: &Image<'_>,
+    goals: [Image<'_>; GOALS],
     warp: &Warp,
     out: &mut [f32],
 ) {
-    let [observation, goal] = [observation, goal].map(Image::new);
     let inverse = warp.motion_px.inverse();
     let (cos, sin) = (inverse.rotation.re, inverse.rotation.im);
     let offset = inverse.translation.vector;
@@ -186,15 +184,15 @@ fn encode_as(
             [rgb.x, rgb.y, rgb.z, cell[3]]
         }
     };
-    let cells = out.chunks_exact_mut(encoding.channels());
+    let [own, each] = reading.channels();
+    let cells = out.chunks_exact_mut(own + each * GOALS);
     for (index, out) in cells.enumerate() {
         let (row, col) = (index / observation.cols, index % observation.cols);
         let (x, y) = (col as f64 + 0.5, row as f64 + 0.5);
         let x_source = (cos * x - sin * y + offset.x) as f32;
         let y_source = (sin * x + cos * y + offset.y) as f32;
-        let seen = colour(observation.sample(x_source, y_source, interpolation));
-        let wanted = colour(goal.sample(x_source, y_source, interpolation));
-        encoding.write(seen, wanted, out);
+        let at = |image: &Image<'_>| colour(image.sample(x_source, y_source, interpolation));
+        reading.write(at(observation), goals.iter().map(at), out);
     }
 }
 
@@ -204,6 +202,21 @@ pub(crate) fn tensor(encoding: Encoding, config: &NetworkConfig, encoded: &[f32]
     Tensor::from_slice(encoded)
         .view([-1, rows, cols, encoding.channels() as i64])
         .permute([0, 3, 1, 2])
+}
+
+/// Refuses goals that are not those that the network is conditioned on.
+pub(crate) fn check_goal(config: &NetworkConfig, goal: Goal<'_>) -> Result<(), Error> {
+    let (actual, expected) = (goal.images().count(), config.conditioning.images());
+    if actual != expected {
+        let conditioning = config.conditioning;
+        return Err(Error::Goals {
+            conditioning,
+            actual,
+            expected,
+        });
+    }
+    goal.images()
+        .try_for_each(|image| check_heightmap(config, "goal", image))
 }
 
 /// Refuses a heightmap that does not fit the network or itself.
@@ -271,7 +284,7 @@ impl Label {
     /// Checks the sample, and reads its label.
     pub fn of(config: &NetworkConfig, index: usize, sample: &Sample<'_>) -> Result<Self, Error> {
         check_heightmap(config, "observation", sample.observation)?;
-        check_heightmap(config, "goal", sample.goal)?;
+        check_goal(config, sample.goal)?;
         let workspace = &sample.observation.workspace;
         for (what, pose) in [("pick", &sample.pick), ("place", &sample.place)] {
             let position = to_px(workspace, pose);
@@ -322,6 +335,47 @@ mod tests {
     use nalgebra::Vector2;
     use proptest::prelude::*;
 
+    const RAW: Encoding = Encoding {
+        reading: Reading::Raw,
+        goals: 1,
+    };
+
+    #[test]
+    fn each_goal_has_its_own_difference() {
+        let [observation, next, last] = [1.0, 3.0, 6.0].map(|height_m: f32| {
+            let mut heightmap = Heightmap::new(Workspace::RAVENS);
+            heightmap.height_m.fill(0.04 * height_m);
+            heightmap.rgb.fill(height_m as u8);
+            heightmap
+        });
+        let reading = Reading::Difference;
+        let encoding = Encoding { reading, goals: 2 };
+        assert_eq!(encoding.channels(), 24);
+        let mut out = vec![0.0; 24 * observation.workspace.len()];
+        let (image, last) = (&next, Some(&last));
+        encode(
+            encoding,
+            &observation,
+            Goal { image, last },
+            &Warp::identity(),
+            &mut out,
+        );
+        let close = |index: usize, value: f32| (out[index] - value).abs() < 1e-6;
+        // Height of the observation; height, its difference and absolute difference of each goal.
+        for (index, value) in [
+            (3, 1.0),
+            (7, 3.0),
+            (11, 2.0),
+            (13, 2.0),
+            (17, 6.0),
+            (21, 5.0),
+            (23, 5.0),
+        ] {
+            assert!(close(index, value), "channel {index} is {}", out[index]);
+        }
+        assert!(close(12, 2.0 / 128.0) && close(22, 5.0 / 128.0));
+    }
+
     fn numbered() -> Heightmap {
         let mut heightmap = Heightmap::new(Workspace::RAVENS);
         for (index, height) in heightmap.height_m.iter_mut().enumerate() {
@@ -333,7 +387,7 @@ mod tests {
     fn heights(warp: &Warp) -> Vec<f32> {
         let heightmap = numbered();
         let mut out = vec![0.0; 8 * heightmap.workspace.len()];
-        encode(Encoding::Raw, &heightmap, &heightmap, warp, &mut out);
+        encode(RAW, &heightmap, (&heightmap).into(), warp, &mut out);
         out.iter().skip(3).step_by(8).copied().collect()
     }
 
@@ -405,7 +459,7 @@ mod tests {
             let label = motion_px * Point2::new(col as f64 + 0.5, row as f64 + 0.5);
             prop_assume!((1.0..159.0).contains(&label.x) && (1.0..319.0).contains(&label.y));
             let mut out = vec![0.0; 8 * heightmap.workspace.len()];
-            encode(Encoding::Raw, &heightmap, &heightmap, &warp, &mut out);
+            encode(RAW, &heightmap, (&heightmap).into(), &warp, &mut out);
             let index = label.y.floor() as usize * 160 + label.x.floor() as usize;
             prop_assert_eq!(out[8 * index + 3], 1.0);
         }
@@ -432,7 +486,7 @@ mod tests {
         let heightmap = numbered();
         let sample = Sample {
             observation: &heightmap,
-            goal: &heightmap,
+            goal: (&heightmap).into(),
             pick: Isometry2::new(Vector2::new(0.5, 0.0), 0.0),
             place: Isometry2::new(Vector2::new(0.5, f64::NAN), 0.0),
         };

@@ -18,12 +18,12 @@ mod trainer;
 
 pub use checkpoint::{ModelCard, Storage};
 pub use config::{
-    Augmentation, Compact, Device, GoalConditioning, Interpolation, Network, NetworkConfig,
-    PlaceLoss, Precision, Resnet43, Schedule, TrainingConfig,
+    Augmentation, Compact, Device, GoalConditioning, GrConvnet, Interpolation, Network,
+    NetworkConfig, PlaceLoss, Precision, Resnet43, Schedule, TrainingConfig,
 };
 pub use error::Error;
 pub use policy::{Decision, Policy, ScoreMap};
-pub use sample::Sample;
+pub use sample::{Goal, Sample};
 pub use trainer::{Losses, Trainer};
 
 use std::sync::atomic::{AtomicUsize, Ordering};

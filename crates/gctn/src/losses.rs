@@ -229,7 +229,7 @@ mod tests {
         Features {
             pick: Tensor::zeros([1, 160, 80], (Kind::Float, tch::Device::Cpu)),
             query: image(sample.observation),
-            key: image(sample.goal).constant_pad_nd([12; 4]),
+            key: image(sample.goal.image).constant_pad_nd([12; 4]),
             scale: Tensor::ones([1], (Kind::Float, tch::Device::Cpu)),
         }
     }
@@ -245,7 +245,7 @@ mod tests {
             let held = Vector2::new(0.012, 0.007);
             let sample = Sample {
                 observation: &observation,
-                goal: &goal,
+                goal: (&goal).into(),
                 pick: Isometry2::new((first * Point2::from(held)).coords, 0.1),
                 place: Isometry2::new((then * Point2::from(held)).coords, 0.1 + turn),
             };

@@ -6,10 +6,10 @@ use std::path::Path;
 use tch::{Kind, Tensor};
 
 use crate::augment::Warp;
-use crate::input::{check_heightmap, encode, rotation_angle, tensor, to_px, to_world};
+use crate::input::{check_goal, check_heightmap, encode, rotation_angle, tensor, to_px, to_world};
 use crate::losses::place_logits;
 use crate::network::{Builder, Model};
-use crate::{Device, Error, ModelCard, NetworkConfig, Precision, checkpoint};
+use crate::{Device, Error, Goal, ModelCard, NetworkConfig, Precision, checkpoint};
 
 /// A trained network that decides.
 #[derive(Debug)]
@@ -92,18 +92,19 @@ impl Policy {
         &self.card
     }
 
-    /// Decides where to pick and where to place, given what is seen and what it should become. Cells near
-    /// an excluded pick (world) are left out. The same input and number of threads give the same bits.
-    pub fn decide(
+    /// Decides where to pick and where to place, given what is seen and what it should become (the goals that
+    /// the network is [conditioned](crate::GoalConditioning) on). Cells near an excluded pick (world) are left out. The same input and number of threads give the same bits.
+    pub fn decide<'a>(
         &self,
         observation: &Heightmap,
-        goal: &Heightmap,
+        goal: impl Into<Goal<'a>>,
         exclude: &[Isometry2<f64>],
     ) -> Result<Decision, Error> {
         crate::apply_threads();
         let config = &self.model.config;
+        let goal = goal.into();
         check_heightmap(config, "observation", observation)?;
-        check_heightmap(config, "goal", goal)?;
+        check_goal(config, goal)?;
         let workspace = &observation.workspace;
         let exclude_px: Vec<_> = exclude.iter().map(|pick| to_px(workspace, pick)).collect();
         tch::no_grad(|| {

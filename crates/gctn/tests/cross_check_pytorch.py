@@ -64,7 +64,7 @@ def hourglass(net, name, x):
     return x
 
 
-def published(net, config, observation, goal):
+def published(net, config, observation, *goals):
     """Pick logits, query and key features with their margin, scale."""
 
     def image(heightmap, rows, cols):
@@ -77,31 +77,49 @@ def published(net, config, observation, goal):
     rows, cols = config["rows"], config["cols"]
     edge = max(rows, cols)
     top, left = (edge - rows) // 2, (edge - cols) // 2
-    stacked = torch.cat([image(observation, top, left), image(goal, top, left)], 1)
+    stacked = torch.cat([image(seen, top, left) for seen in (observation, *goals)], 1)
     pick = hourglass(net, "pick", stacked)[0, 0, top : top + rows, left : left + cols]
     half = config["network"]["crop_px"] // 2
-    seen, wanted = image(observation, half, half), image(goal, half, half)
-    goal_features = hourglass(net, "goal", wanted)
+    seen, wanted = image(observation, half, half), [image(goal, half, half) for goal in goals]
+    goal_features = hourglass(net, "goal", torch.cat(wanted, 1))
     query = hourglass(net, "query", seen) * goal_features
     key = hourglass(net, "key", seen) * goal_features
     return pick, query[0], key[0], (2 * half) ** -2.0
 
 
-def compact(net, config, x):
-    """Pick logits, query features, key features with their margin, scale."""
+def block(net, name, x):
+    return F.relu(x + net.conv(f"{name}.second", F.relu(net.conv(f"{name}.first", x))))
 
-    def block(name, x):
-        return F.relu(x + net.conv(f"{name}.second", F.relu(net.conv(f"{name}.first", x))))
 
+def compact_trunk(net, config, x):
     skips = []
     for level, blocks in enumerate(config["network"]["blocks"]):
         x = F.relu(net.conv("stem" if level == 0 else f"level{level}.down", x, 2))
         for index in range(blocks):
-            x = block(f"level{level}.block{index}", x)
+            x = block(net, f"level{level}.block{index}", x)
         skips.append(x)
     for level in (2, 1, 0):
         x = upsample(net.conv(f"rise{level}.lateral", x)) + skips[level]
-        x = block(f"rise{level}.block", x)
+        x = block(net, f"rise{level}.block", x)
+    return x
+
+
+def gr_convnet_trunk(net, config, x):
+    for index in range(3):
+        x = F.relu(net.conv(f"down{index}", x, 2))
+    for index in range(config["network"]["blocks"]):
+        x = block(net, f"block{index}", x)
+    for index in range(2):
+        x = F.relu(net.conv(f"up{index}", upsample(x)))
+    return x
+
+
+TRUNKS = {"compact": compact_trunk, "gr_convnet": gr_convnet_trunk}
+
+
+def shared(net, config, x):
+    """Pick logits, query features, key features with their margin, scale."""
+    x = TRUNKS[config["network"]["kind"]](net, config, x)
     heads = F.relu(net.conv("heads", x)).chunk(3, 1)
     pick, query, key = (net.conv(name, head)[0] for name, head in zip(("pick", "query", "key"), heads))
     margin = config["network"]["window_cells"] // 2
@@ -152,14 +170,18 @@ class Case:
             assert stored == self.config, "the checkpoint is of another network"
         for x in self.weights.values():
             x.requires_grad_(self.case["slopes"])
-        self.compact = self.config["network"]["kind"] == "compact"
-        self.stride = 2 if self.compact else 1
+        self.shared = self.config["network"]["kind"] in TRUNKS
+        self.stride = 2 if self.shared else 1
         self.rows = self.config["rows"] // self.stride
         self.cols = self.config["cols"] // self.stride
 
     def named(self, prefix):
         prefix += "/"
         return {name[len(prefix) :]: x for name, x in self.tensors.items() if name.startswith(prefix)}
+
+    def images(self):
+        both = self.config["conditioning"] == "both"
+        return ("observation", "goal", "last") if both else ("observation", "goal")
 
     def index(self, point_px):
         """Image coordinates -> x, y counted in cells from the centre of the first."""
@@ -181,17 +203,17 @@ class Case:
     def run(self):
         """Pick logits, place logits of every rotation, and the two losses."""
         net = Net(self.weights)
-        if self.compact:
-            pick, query, key, scale = compact(net, self.config, self.tensors["input"].to(self.kind)[None])
+        if self.shared:
+            pick, query, key, scale = shared(net, self.config, self.tensors["input"].to(self.kind)[None])
         else:
-            images = [{name: x.to(self.kind) for name, x in self.named(of).items()} for of in ("observation", "goal")]
+            images = [{name: x.to(self.kind) for name, x in self.named(of).items()} for of in self.images()]
             pick, query, key, scale = published(net, self.config, *images)
         # From the features on in 64 bits, so that what rounding there is is the other side's.
         pick, query, key = pick.double(), query.double(), key.double()
         network, rotations = self.config["network"], self.config["rotations"]
-        size = network["window_cells"] if self.compact else network["crop_px"]
-        bilinear = self.compact or network["rotation_sampling"] == "bilinear"
-        margin = 0 if self.compact else size // 2
+        size = network["window_cells"] if self.shared else network["crop_px"]
+        bilinear = network["rotation_sampling"] == "bilinear"
+        margin = 0 if self.shared else size // 2
         center = [coordinate + margin for coordinate in self.index(self.case["pick_px"])]
         right, wrong = self.case["rotation"], self.case["wrong_rotation"]
         kernels = torch.stack(

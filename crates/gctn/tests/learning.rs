@@ -104,7 +104,7 @@ fn sample<'a>(observation: &'a Heightmap, goal: &'a Heightmap) -> Sample<'a> {
     let corner = observation.workspace.origin_m.coords;
     Sample {
         observation,
-        goal,
+        goal: goal.into(),
         pick: Isometry2::new(corner + Vector2::new(0.03, 0.05), 0.0),
         place: Isometry2::new(corner + Vector2::new(0.06, 0.11), 2.0),
     }
@@ -237,7 +237,7 @@ fn bad_samples_and_batches_are_refused_by_name() {
     let mut broken = goal.clone();
     broken.height_m[7] = f32::NAN;
     let bad = Sample {
-        goal: &broken,
+        goal: (&broken).into(),
         ..good
     };
     let error = trainer

@@ -2,7 +2,7 @@
 
 use crate::sampling::{Sampling, SamplingError};
 use bags::{Demonstration, DemonstrationError};
-use gctn::{GoalConditioning, Sample};
+use gctn::{Goal, GoalConditioning, Sample};
 use rand::{Rng, RngExt};
 use std::path::{Path, PathBuf};
 
@@ -26,6 +26,8 @@ struct Step {
     index: usize,
     /// Index of the observation after the first positive delta reward from this step on.
     next_goal: usize,
+    /// Index of the observation after the second one; the same where there is none.
+    goal_after: usize,
 }
 
 /// Why demonstrations cannot be learned from.
@@ -133,14 +135,18 @@ impl DataSet {
     /// Adds a demonstration.
     pub fn push(&mut self, demonstration: Demonstration) -> Result<(), DataSetError> {
         let mut steps = Vec::with_capacity(demonstration.steps.len());
-        let mut next_goal = None;
+        let mut goals = None;
         for (index, step) in demonstration.steps.iter().enumerate().rev() {
             if step.delta_reward > 0.0 {
-                next_goal = Some(index + 1);
+                goals = Some((index + 1, goals.map_or(index + 1, |(next, _)| next)));
             }
             // Steps after the last reward lead nowhere.
-            if let Some(next_goal) = next_goal {
-                steps.push(Step { index, next_goal });
+            if let Some((next_goal, goal_after)) = goals {
+                steps.push(Step {
+                    index,
+                    next_goal,
+                    goal_after,
+                });
             }
         }
         if steps.is_empty() {
@@ -178,11 +184,13 @@ impl DataSet {
             .sum()
     }
 
-    /// Draws a sample: a demonstration uniformly, then a step by its weights (paper, section IV-B).
+    /// Draws a sample: a demonstration uniformly, then a step by its weights (paper, section IV-B). With
+    /// probability `goal_jitter` its goal is the one after the next.
     pub fn draw<R: Rng>(
         &self,
         sampling: &Sampling,
         conditioning: GoalConditioning,
+        goal_jitter: f64,
         rng: &mut R,
     ) -> Result<Sample<'_>, DataSetError> {
         if self.is_empty() {
@@ -190,14 +198,26 @@ impl DataSet {
         }
         let indexed = &self.demonstrations[rng.random_range(0..self.demonstrations.len())];
         let step = indexed.steps[sampling.draw(&indexed.modules, rng)?];
+        let jittered = goal_jitter > 0.0 && rng.random::<f64>() < goal_jitter;
+        let observation = |index| indexed.demonstration.observation(index);
+        let next = observation(if jittered {
+            step.goal_after
+        } else {
+            step.next_goal
+        });
+        let last = observation(indexed.demonstration.steps.len());
         let goal = match conditioning {
-            GoalConditioning::NextStep => step.next_goal,
-            GoalConditioning::Final => indexed.demonstration.steps.len(),
+            GoalConditioning::NextStep => next.into(),
+            GoalConditioning::Final => last.into(),
+            GoalConditioning::Both => Goal {
+                image: next,
+                last: Some(last),
+            },
         };
         let action = &indexed.demonstration.steps[step.index].action;
         Ok(Sample {
-            observation: indexed.demonstration.observation(step.index),
-            goal: indexed.demonstration.observation(goal),
+            observation: observation(step.index),
+            goal,
             pick: action.pick,
             place: action.place,
         })
@@ -257,19 +277,42 @@ mod tests {
         let mut rng = ChaCha8Rng::seed_from_u64(0);
         for _ in 0..50 {
             let sample = data
-                .draw(&Sampling::Plain, GoalConditioning::NextStep, &mut rng)
+                .draw(&Sampling::Plain, GoalConditioning::NextStep, 0.0, &mut rng)
                 .unwrap();
             let expected = [2.0, 2.0, 3.0][sample.observation.height_m[0] as usize];
-            assert_eq!(sample.goal.height_m[0], expected);
+            assert_eq!(sample.goal.image.height_m[0], expected);
             assert_eq!(
                 sample.place.translation.x,
                 f64::from(sample.observation.height_m[0])
             );
             let sample = data
-                .draw(&Sampling::Plain, GoalConditioning::Final, &mut rng)
+                .draw(&Sampling::Plain, GoalConditioning::Final, 0.0, &mut rng)
                 .unwrap();
-            assert_eq!(sample.goal.height_m[0], 4.0);
+            assert_eq!(sample.goal.image.height_m[0], 4.0);
+            let sample = data
+                .draw(&Sampling::Plain, GoalConditioning::Both, 0.0, &mut rng)
+                .unwrap();
+            assert_eq!(sample.goal.last.unwrap().height_m[0], 4.0);
         }
+    }
+
+    #[test]
+    fn a_jittered_goal_is_the_one_after_the_next() {
+        let mut data = DataSet::default();
+        data.push(demonstration(&[0.0, 0.5, 0.5])).unwrap();
+        let mut rng = ChaCha8Rng::seed_from_u64(0);
+        let mut later = 0;
+        for _ in 0..2000 {
+            let sample = data
+                .draw(&Sampling::Plain, GoalConditioning::NextStep, 0.25, &mut rng)
+                .unwrap();
+            let goal = sample.goal.image.height_m[0];
+            let next = [2.0, 2.0, 3.0][sample.observation.height_m[0] as usize];
+            assert!(goal == next || goal == 3.0);
+            later += usize::from(goal != next);
+        }
+        // A quarter of the two steps that have a goal after the next.
+        assert!((270..400).contains(&later), "{later}");
     }
 
     #[test]

@@ -1,6 +1,6 @@
 //! Evaluation as in the paper (section VI): completion rate over held-out episodes.
 
-use crate::goal::NextStepOracle;
+use crate::goal::{NextStepOracle, goal};
 use crate::interval::wilson_95;
 use crate::rollout::{Rollout, demonstrate, roll_out};
 use gctn::{GoalConditioning, Policy};
@@ -119,7 +119,9 @@ pub fn attempt(
         environment,
         seed,
         |_, observation| {
-            let goal = goals[oracle.get().index(conditioning)];
+            let Some(goal) = goal(&goals, oracle.get().index(), conditioning) else {
+                return Ok(None);
+            };
             let decision = policy.decide(observation, goal, &[])?;
             Ok(Some(PickPlace {
                 pick: decision.pick,

@@ -1,6 +1,7 @@
 //! Next-step goal modules (paper, section IV-A): which image of the demonstration sequence comes next.
 
-use gctn::GoalConditioning;
+use gctn::{Goal, GoalConditioning};
+use heightmap::Heightmap;
 
 /// The oracle: counts delta rewards, as the paper's operator does who checks each step.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -15,14 +16,9 @@ impl NextStepOracle {
         Self { next: 0, len }
     }
 
-    /// Index of the goal image: the next one of the sequence, or always the last. After the last step
-    /// it stays at the last image.
-    pub fn index(&self, conditioning: GoalConditioning) -> usize {
-        let last = self.len.saturating_sub(1);
-        match conditioning {
-            GoalConditioning::NextStep => self.next.min(last),
-            GoalConditioning::Final => last,
-        }
+    /// Index of the next-step goal in the sequence. After the last step it stays at the last image.
+    pub fn index(&self) -> usize {
+        self.next.min(self.len.saturating_sub(1))
     }
 
     /// Tells of a step's delta reward: a gain advances by one image, a loss steps back by one.
@@ -35,6 +31,25 @@ impl NextStepOracle {
     }
 }
 
+/// What a policy is shown of the demonstration sequence `images` when `next` is the index of its next-step
+/// goal. None of an empty sequence.
+pub fn goal<'a>(
+    images: &[&'a Heightmap],
+    next: usize,
+    conditioning: GoalConditioning,
+) -> Option<Goal<'a>> {
+    let last = *images.last()?;
+    let next = images.get(next).copied().unwrap_or(last);
+    Some(match conditioning {
+        GoalConditioning::NextStep => next.into(),
+        GoalConditioning::Final => last.into(),
+        GoalConditioning::Both => Goal {
+            image: next,
+            last: Some(last),
+        },
+    })
+}
+
 #[cfg(test)]
 mod tests {
     use super::*;
@@ -43,10 +58,28 @@ mod tests {
     fn only_a_delta_reward_advances_the_goal() {
         let mut oracle = NextStepOracle::new(3);
         oracle.observe(0.0);
-        assert_eq!(oracle.index(GoalConditioning::NextStep), 0);
+        assert_eq!(oracle.index(), 0);
         oracle.observe(0.5);
-        assert_eq!(oracle.index(GoalConditioning::NextStep), 1);
-        assert_eq!(oracle.index(GoalConditioning::Final), 2);
+        assert_eq!(oracle.index(), 1);
+    }
+
+    #[test]
+    fn each_conditioning_is_shown_its_images() {
+        let images = [1, 2, 3].map(|mark| {
+            let mut heightmap = Heightmap::new(heightmap::Workspace::RAVENS);
+            heightmap.rgb[0] = mark;
+            heightmap
+        });
+        let images: Vec<_> = images.iter().collect();
+        let shown = |next, conditioning| {
+            let goal = goal(&images, next, conditioning).unwrap();
+            (goal.image.rgb[0], goal.last.map(|last| last.rgb[0]))
+        };
+        assert_eq!(shown(1, GoalConditioning::NextStep), (2, None));
+        assert_eq!(shown(1, GoalConditioning::Final), (3, None));
+        assert_eq!(shown(1, GoalConditioning::Both), (2, Some(3)));
+        assert_eq!(shown(7, GoalConditioning::Both), (3, Some(3)));
+        assert!(goal(&[], 0, GoalConditioning::Both).is_none());
     }
 
     #[test]
@@ -55,6 +88,6 @@ mod tests {
         for _ in 0..5 {
             oracle.observe(0.5);
         }
-        assert_eq!(oracle.index(GoalConditioning::NextStep), 1);
+        assert_eq!(oracle.index(), 1);
     }
 }

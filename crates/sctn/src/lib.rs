@@ -1,5 +1,6 @@
 //! Sequence-conditioned learning: data set, weighted sampling, training, evaluation.
 
+mod agent;
 mod data_set;
 mod evaluation;
 mod goal;
@@ -9,9 +10,10 @@ mod rollout;
 mod sampling;
 mod training;
 
+pub use agent::Agent;
 pub use data_set::{DataSet, DataSetError, demonstration_path};
 pub use evaluation::{EpisodeReport, Evaluation, EvaluationError, attempt, evaluate};
-pub use goal::NextStepOracle;
+pub use goal::{NextStepOracle, goal};
 pub use interval::wilson_95;
 pub use recipe::{Recipe, RecipeError, Validation};
 pub use rollout::{Rollout, demonstrate, roll_out};

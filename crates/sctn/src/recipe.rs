@@ -20,6 +20,10 @@ pub struct Recipe {
     /// Which step is drawn how often.
     #[serde(default)]
     pub sampling: Sampling,
+    /// Probability that a sample's next-step goal is the one after the next, against calling a step done too
+    /// early.
+    #[serde(default)]
+    pub goal_jitter: f64,
     /// Number of snapshots, evenly spread over the training.
     pub snapshots: u64,
     /// How snapshots are compared.
@@ -125,6 +129,7 @@ impl Recipe {
         let Self {
             problems,
             demonstrations,
+            goal_jitter,
             snapshots,
             validation,
             ..
@@ -141,6 +146,8 @@ impl Recipe {
             demonstrations.to_string(),
             "at least 1",
         )?;
+        let good = (0.0..=1.0).contains(goal_jitter);
+        field("goal_jitter", good, goal_jitter.to_string(), "0 to 1")?;
         let good = (1..=recipe.training.steps).contains(snapshots);
         field(
             "snapshots",
@@ -193,11 +200,44 @@ mod tests {
     }
 
     #[test]
+    fn the_recipe_of_all_options_says_what_is_meant_where_nothing_is_said() {
+        let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../config/recipes");
+        let all = Recipe::load(&folder.join("all_options.yaml")).unwrap();
+        let network = NetworkConfig::compact();
+        assert_eq!(all.network, network);
+        assert_eq!(all.training, TrainingConfig::compact());
+        assert_eq!(all.sampling, Sampling::default());
+        assert_eq!(all.goal_jitter, 0.0);
+    }
+
+    #[test]
+    fn every_shipped_recipe_loads() {
+        let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../config/recipes");
+        let mut count = 0;
+        for entry in std::fs::read_dir(folder).unwrap() {
+            let path = entry.unwrap().path();
+            if path.is_file() {
+                Recipe::load(&path).unwrap();
+                count += 1;
+            }
+        }
+        assert!(count >= 2);
+    }
+
+    #[test]
     fn a_field_that_is_unknown_or_out_of_range_is_refused_by_name() {
         assert!(changed("snapshots:", "snapshot:").contains("snapshot"));
         assert!(changed("seed: 1}", "seed: 2}").contains("validation.seed is 2"));
         assert!(changed("snapshots: 4", "snapshots: 0").contains("snapshots is 0"));
         assert!(changed("batch: 4", "batch: 0").contains("batch is 0"));
+        assert!(
+            changed("snapshots: 4", "snapshots: 4\ngoal_jitter: 1.5")
+                .contains("goal_jitter is 1.5")
+        );
+        assert!(
+            changed("weighting: plain", "weighting: unif").contains("unif_step"),
+            "the known ones are named"
+        );
         assert!(
             changed("demonstrations: 100", "demonstrations: 0").contains("demonstrations is 0")
         );

@@ -83,7 +83,14 @@ pub enum Sampling {
     /// All steps of a demonstration alike, as in the plain agents.
     #[default]
     Plain,
-    /// First a module, then a step within it, as in the agents -Step, -Unif-Step and -Comp-Step.
+    /// Steps by the paper's step weights, as in the agents -Step; modules only by how many steps they have.
+    Step,
+    /// First a module, all alike, then a step by the paper's step weights, as in the agents -Unif-Step.
+    UnifStep,
+    /// First a module by the paper's inferred complexity, then a step by the paper's step weights, as in the
+    /// agents -Comp-Step.
+    CompStep,
+    /// First a module, then a step within it, by these weights.
     Modules {
         /// By name of the module.
         modules: BTreeMap<String, ModuleWeights>,
@@ -108,7 +115,7 @@ pub enum SamplingError {
         at_least: f64,
     },
     /// A demonstration holds a module without weights.
-    #[error("sampling.modules has no weights for the module {module} of the demonstrations")]
+    #[error("sampling has no weights for the module {module} of the demonstrations")]
     UnknownModule {
         /// Name of the module.
         module: String,
@@ -151,28 +158,52 @@ impl Sampling {
         if modules_of_steps.is_empty() {
             return Err(SamplingError::Empty);
         }
-        let Self::Modules { modules } = self else {
+        if *self == Self::Plain {
             return Ok(rng.random_range(0..modules_of_steps.len()));
-        };
+        }
         let spans = spans(modules_of_steps);
         let mut weights = Vec::with_capacity(spans.len());
         for (module, _) in &spans {
-            let found = modules
-                .get(*module)
-                .ok_or_else(|| SamplingError::UnknownModule {
-                    module: (*module).into(),
-                })?;
-            weights.push(*found);
+            let weight = self.weights(module);
+            weights.push(weight.ok_or_else(|| SamplingError::UnknownModule {
+                module: (*module).into(),
+            })?);
+        }
+        let step_weights = |chosen: usize| {
+            let (len, steps) = (spans[chosen].1.len(), weights[chosen].steps);
+            (0..len).map(move |index| steps.weight(index, len))
+        };
+        if *self == Self::Step {
+            return Ok(draw_weighted((0..spans.len()).flat_map(step_weights), rng));
         }
         let chosen = draw_weighted(weights.iter().map(|module| module.weight), rng);
-        let span = &spans[chosen].1;
-        let steps = weights[chosen].steps;
-        Ok(span.start
-            + draw_weighted(
-                (0..span.len()).map(|index| steps.weight(index, span.len())),
-                rng,
-            ))
+        Ok(spans[chosen].1.start + draw_weighted(step_weights(chosen), rng))
     }
+
+    /// Weights of a module, where there are any for it.
+    fn weights(&self, module: &str) -> Option<ModuleWeights> {
+        match self {
+            Self::Modules { modules } => modules.get(module).copied(),
+            Self::CompStep => published(module),
+            Self::Plain | Self::Step | Self::UnifStep => published(module).map(|weights| {
+                let weight = 1.0;
+                ModuleWeights { weight, ..weights }
+            }),
+        }
+    }
+}
+
+/// The paper's weights of its four modules: inferred complexity in thousands of gradient steps, and what the
+/// search of its appendix found for the steps (paper, table "Hyperparameters for weighted sampling").
+fn published(module: &str) -> Option<ModuleWeights> {
+    let (weight, steps) = match module {
+        "placing" => (4.0, StepWeights::Linear { max_weight: 2.76 }),
+        "chaining" => (20.0, StepWeights::Last { max_weight: 1.92 }),
+        "routing" => (20.0, StepWeights::Linear { max_weight: 1.76 }),
+        "stacking" => (12.0, StepWeights::Linear { max_weight: 1.50 }),
+        _ => return None,
+    };
+    Some(ModuleWeights { weight, steps })
 }
 
 /// Runs of steps of the same module: demonstrations solve one module after another.
@@ -253,6 +284,32 @@ mod tests {
         assert!((9_600..10_400).contains(&placing), "{placing}");
         // Routing's last step weighs as much as its two others together.
         assert!((14_500..15_500).contains(&counts[11]), "{}", counts[11]);
+    }
+
+    #[test]
+    fn the_agents_of_the_paper_share_modules_and_steps_as_they_say() {
+        let steps = names(&[("placing", 9), ("routing", 3)]);
+        let shares = |sampling: Sampling| {
+            let mut rng = ChaCha8Rng::seed_from_u64(2);
+            let mut counts = [0.0; 12];
+            for _ in 0..40_000 {
+                counts[sampling.draw(&steps, &mut rng).unwrap()] += 1.0 / 40_000.0;
+            }
+            let routing: f64 = counts[9..].iter().sum();
+            (routing, counts[11] / counts[9])
+        };
+        // Routing's last step weighs 1.76 times its first; placing's nine weigh 9 (1 + 2.76) / 2 together.
+        let step = 3.0 * 1.38 / (3.0 * 1.38 + 9.0 * 1.88);
+        for (sampling, routing, ratio) in [
+            (Sampling::Plain, 0.25, 1.0),
+            (Sampling::Step, step, 1.76),
+            (Sampling::UnifStep, 0.5, 1.76),
+            (Sampling::CompStep, 20.0 / 24.0, 1.76),
+        ] {
+            let found = shares(sampling.clone());
+            assert!((found.0 - routing).abs() < 0.01, "{sampling:?}: {found:?}");
+            assert!((found.1 - ratio).abs() < 0.1, "{sampling:?}: {found:?}");
+        }
     }
 
     #[test]

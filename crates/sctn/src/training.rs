@@ -98,12 +98,17 @@ impl Training {
             training,
             network,
             sampling,
+            goal_jitter,
             ..
         } = &self.recipe;
         let mut rng = ChaCha8Rng::seed_from_u64(training.seed);
         rng.set_stream(SAMPLING_STREAM + self.trainer.step());
         let samples: Result<Vec<_>, _> = (0..training.batch)
-            .map(|_| self.data.draw(sampling, network.conditioning, &mut rng))
+            .map(|_| {
+                let conditioning = network.conditioning;
+                self.data
+                    .draw(sampling, conditioning, *goal_jitter, &mut rng)
+            })
             .collect();
         Ok(self.trainer.train_step(&samples?)?)
     }

@@ -9,8 +9,8 @@ mod proposer;
 
 use std::time::{Duration, Instant};
 
-use anyhow::Context as _;
-use gctn::{Decision, Policy};
+use anyhow::{Context as _, bail};
+use gctn::{Decision, GoalConditioning, Policy};
 use msgs::{
     sctn_msgs::{Goal, Heightmap, PickPlace, StepConfirmation, StepResult},
     sensor_msgs::Image,
@@ -58,6 +58,13 @@ pub async fn run(node: Node, parameters: GctnPolicyParameters) -> anyhow::Result
         .await
         .context("loading the checkpoint")?
         .context("parameter checkpoint")?;
+    let conditioning = policy.config().conditioning;
+    if conditioning != GoalConditioning::NextStep {
+        bail!(
+            "parameter checkpoint: {shown} is conditioned on {conditioning:?}, but the goals of the graph are next-step goals: \
+             expected a checkpoint trained with conditioning next_step"
+        );
+    }
     info!("checkpoint {shown} loaded");
 
     // One job at a time: the proposer gives the next when it has the answer.
@@ -107,7 +114,7 @@ fn start_network(node: &Node, policy: Policy) -> (mpsc::Sender<Job>, mpsc::Recei
         while let Some(job) = waiting.blocking_recv() {
             let start = Instant::now();
             let decision = policy
-                .decide(&job.observation, &job.goal, &job.exclude)
+                .decide(&job.observation, &*job.goal, &job.exclude)
                 .map_err(|error| error.to_string());
             let took = start.elapsed();
             let answer = Answer {

@@ -16,7 +16,7 @@ use crate::augment::Warp;
 use crate::input::{Label, encode, tensor};
 use crate::losses::{pick_loss, place_logits, place_loss};
 use crate::{Compact, ModelCard, Network, NetworkConfig, PlaceLoss, Precision, Resnet43, Storage};
-use crate::{Interpolation, checkpoint};
+use crate::{Goal, GoalConditioning, GrConvnet, Interpolation, checkpoint};
 
 /// Who checks.
 #[derive(Clone, Copy, Debug)]
@@ -88,13 +88,18 @@ fn check(
     let mut flat = model.parameters.flat.shallow_clone();
     flat += Tensor::from_slice(&noise).to_kind(flat.kind());
 
-    let [observation, goal] = [(); 2].map(|()| scene(config, rng));
+    let [observation, goal, last] = [(); 3].map(|()| scene(config, rng));
+    let both = config.conditioning == GoalConditioning::Both;
+    let shown = Goal {
+        image: &goal,
+        last: both.then_some(&last),
+    };
     let encoding = model.encoding();
     let mut encoded = vec![0.0; encoding.channels() * observation.workspace.len()];
     encode(
         encoding,
         &observation,
-        &goal,
+        shown,
         &Warp::identity(),
         &mut encoded,
     );
@@ -157,7 +162,11 @@ fn check(
         let card = ModelCard::new();
         checkpoint::save(&path, Storage::F32, config, &model.parameters, &card).unwrap();
     }
-    for (name, heightmap) in [("observation", &observation), ("goal", &goal)] {
+    for (name, heightmap) in [
+        ("observation", &observation),
+        ("goal", &goal),
+        ("last", &last),
+    ] {
         let (rows, cols) = (config.rows as i64, config.cols as i64);
         let rgb = Tensor::from_slice(&heightmap.rgb).view([rows, cols, 3]);
         let height_m = Tensor::from_slice(&heightmap.height_m).view([rows, cols]);
@@ -289,6 +298,58 @@ fn the_compact_network_and_its_gradients_are_what_pytorch_says() {
 #[ignore = "needs PyTorch: cargo xtask test runs it where there is one"]
 fn the_published_network_and_its_gradients_are_what_pytorch_says() {
     the_published_network_is_what_they_say(Judge::PyTorch);
+}
+
+#[test]
+#[ignore = "needs PyTorch: cargo xtask test runs it where there is one"]
+fn the_gr_convnet_and_its_gradients_are_what_pytorch_says() {
+    for rotation_sampling in [Interpolation::Nearest, Interpolation::Bilinear] {
+        let config = small(Network::GrConvnet(GrConvnet {
+            channels: 6,
+            blocks: 2,
+            feature_channels: 4,
+            window_cells: 9,
+            rotation_sampling,
+        }));
+        check(
+            Judge::PyTorch,
+            &config,
+            true,
+            PlaceLoss::AllRotations,
+            0.7,
+            1e-9,
+        );
+    }
+}
+
+#[test]
+#[ignore = "needs PyTorch: cargo xtask test runs it where there is one"]
+fn networks_conditioned_on_both_goals_are_what_pytorch_says() {
+    let compact = Network::Compact(Compact {
+        channels: [6, 8, 12, 16],
+        feature_channels: 4,
+        window_cells: 9,
+        rotation_sampling: Interpolation::Nearest,
+        ..Compact::default()
+    });
+    let resnet43 = Network::Resnet43(Resnet43 {
+        crop_px: 16,
+        ..Resnet43::default()
+    });
+    for network in [compact, resnet43] {
+        let config = NetworkConfig {
+            conditioning: GoalConditioning::Both,
+            ..small(network)
+        };
+        check(
+            Judge::PyTorch,
+            &config,
+            true,
+            PlaceLoss::AllRotations,
+            0.7,
+            1e-9,
+        );
+    }
 }
 
 #[test]

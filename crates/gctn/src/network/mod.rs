@@ -3,14 +3,17 @@
 mod compact;
 #[cfg(test)]
 mod cross_check;
+mod gr_convnet;
+mod heads;
 mod parameters;
 mod resnet43;
 
 use tch::{Kind, Tensor};
 
-use crate::input::Encoding;
+use crate::input::{Encoding, Reading};
 use crate::{Interpolation, Network, NetworkConfig, Precision};
 use compact::CompactNet;
+use gr_convnet::GrConvnetNet;
 use resnet43::Resnet43Nets;
 
 pub(crate) use parameters::{Builder, Parameters};
@@ -63,6 +66,7 @@ impl Grid {
 #[derive(Debug)]
 enum Nets {
     Compact(CompactNet),
+    GrConvnet(GrConvnetNet),
     Resnet43(Resnet43Nets),
 }
 
@@ -72,6 +76,7 @@ pub(crate) struct Model {
     pub config: NetworkConfig,
     pub parameters: Parameters,
     pub grid: Grid,
+    encoding: Encoding,
     precision: Precision,
     nets: Nets,
 }
@@ -79,20 +84,34 @@ pub(crate) struct Model {
 impl Model {
     /// A network with weights from `builder`. The configuration must have been checked.
     pub fn new(config: &NetworkConfig, mut builder: Builder, precision: Precision) -> Self {
+        let encoding = Encoding {
+            reading: match config.network {
+                Network::Resnet43(_) => Reading::Raw,
+                Network::Compact(_) | Network::GrConvnet(_) => Reading::Difference,
+            },
+            goals: config.conditioning.images(),
+        };
+        let inputs = encoding.channels();
+        // Shared trunks answer at half resolution.
+        let half = |window: usize, sampling: Interpolation| Grid {
+            rows: config.rows / 2,
+            cols: config.cols / 2,
+            stride: 2,
+            window,
+            margin: window / 2,
+            query_margin: 0,
+            sampling,
+            subcell: true,
+        };
         let (nets, grid) = match &config.network {
-            Network::Compact(compact) => {
-                let grid = Grid {
-                    rows: config.rows / 2,
-                    cols: config.cols / 2,
-                    stride: 2,
-                    window: compact.window_cells,
-                    margin: compact.window_cells / 2,
-                    query_margin: 0,
-                    sampling: Interpolation::Bilinear,
-                    subcell: true,
-                };
-                (Nets::Compact(CompactNet::new(compact, &mut builder)), grid)
-            }
+            Network::Compact(compact) => (
+                Nets::Compact(CompactNet::new(compact, inputs, &mut builder)),
+                half(compact.window_cells, compact.rotation_sampling),
+            ),
+            Network::GrConvnet(gr_convnet) => (
+                Nets::GrConvnet(GrConvnetNet::new(gr_convnet, inputs, &mut builder)),
+                half(gr_convnet.window_cells, gr_convnet.rotation_sampling),
+            ),
             Network::Resnet43(resnet43) => {
                 let grid = Grid {
                     rows: config.rows,
@@ -105,7 +124,7 @@ impl Model {
                     subcell: false,
                 };
                 (
-                    Nets::Resnet43(Resnet43Nets::new(resnet43, &mut builder)),
+                    Nets::Resnet43(Resnet43Nets::new(resnet43, encoding.goals, &mut builder)),
                     grid,
                 )
             }
@@ -114,6 +133,7 @@ impl Model {
             config: config.clone(),
             parameters: builder.finish(),
             grid,
+            encoding,
             precision,
             nets,
         }
@@ -121,10 +141,7 @@ impl Model {
 
     /// What the network reads.
     pub fn encoding(&self) -> Encoding {
-        match &self.nets {
-            Nets::Compact(_) => Encoding::Difference,
-            Nets::Resnet43(_) => Encoding::Raw,
-        }
+        self.encoding
     }
 
     /// Runs the convolutions. `input` is what [`crate::input::tensor`] makes, on the weights' device.
@@ -136,6 +153,7 @@ impl Model {
         };
         match &self.nets {
             Nets::Compact(net) => net.forward(&input, kind),
+            Nets::GrConvnet(net) => net.forward(&input, kind),
             Nets::Resnet43(nets) => nets.forward(&input, kind),
         }
     }

@@ -102,6 +102,7 @@ pub(super) struct Resnet43Nets {
     key: Hourglass,
     goal: Hourglass,
     crop: i64,
+    goals: i64,
 }
 
 /// Mean and standard deviation of colour (as a fraction) and height (m) in Ravens.
@@ -120,14 +121,15 @@ fn channels_last(x: &Tensor) -> Tensor {
 }
 
 impl Resnet43Nets {
-    pub fn new(config: &Resnet43, builder: &mut Builder) -> Self {
+    pub fn new(config: &Resnet43, goals: usize, builder: &mut Builder) -> Self {
         let features = config.feature_channels;
         Self {
-            pick: Hourglass::new("pick", 12, 1, builder),
+            pick: Hourglass::new("pick", 6 + 6 * goals, 1, builder),
             query: Hourglass::new("query", 6, features, builder),
             key: Hourglass::new("key", 6, features, builder),
-            goal: Hourglass::new("goal", 6, features, builder),
+            goal: Hourglass::new("goal", 6 * goals, features, builder),
             crop: config.crop_px as i64,
+            goals: goals as i64,
         }
     }
 
@@ -138,23 +140,26 @@ impl Resnet43Nets {
             let x = normalise(&x.constant_pad_nd([cols, cols, rows, rows]));
             channels_last(&x.to_kind(kind))
         };
-        let (observation, goal) = (input.narrow(1, 0, 4), input.narrow(1, 4, 4));
+        // The observation, then the goals.
+        let images: Vec<Tensor> = (0..=self.goals)
+            .map(|index| input.narrow(1, 4 * index, 4))
+            .collect();
+        let stacked = |images: &[Tensor], margins: [i64; 2]| {
+            let images: Vec<_> = images.iter().map(|image| padded(image, margins)).collect();
+            channels_last(&Tensor::cat(&images, 1))
+        };
 
         // The pick net reads a square.
         let edge = rows.max(cols);
         let margins = [(edge - rows) / 2, (edge - cols) / 2];
-        let stacked = Tensor::cat(
-            &[&padded(&observation, margins), &padded(&goal, margins)],
-            1,
-        );
-        let pick = self.pick.forward(&channels_last(&stacked)).squeeze_dim(1);
+        let pick = self.pick.forward(&stacked(&images, margins)).squeeze_dim(1);
         let pick = pick.narrow(1, margins[0], rows).narrow(2, margins[1], cols);
 
         let margins = [self.crop / 2; 2];
-        let observation = padded(&observation, margins);
+        let observation = padded(&images[0], margins);
         let goal = self
             .goal
-            .forward(&padded(&goal, margins))
+            .forward(&stacked(&images[1..], margins))
             .to_kind(input.kind());
         let query = self.query.forward(&observation).to_kind(input.kind()) * &goal;
         let key = self.key.forward(&observation).to_kind(input.kind()) * &goal;

@@ -71,7 +71,7 @@ impl Toy {
     pub fn sample(&self) -> Sample<'_> {
         Sample {
             observation: &self.observation,
-            goal: &self.goal,
+            goal: (&self.goal).into(),
             pick: self.pick,
             place: self.place,
         }

@@ -85,6 +85,10 @@ class Process:
     def exit_code(self) -> int | None:
         return self._child.poll()
 
+    def signal(self, number: int) -> None:
+        """Sends it a signal."""
+        self._child.send_signal(number)
+
     def output(self) -> str:
         """Standard output so far."""
         return self._output_file.read_text(errors="replace")

@@ -19,9 +19,9 @@ pub struct BagInfo {
     pub bytes: u64,
     /// Messages in all.
     pub messages: u64,
-    /// Log time of the first message, since the clock's zero [s].
+    /// Log time of the first message, since the clock's zero, in seconds.
     pub start_s: f64,
-    /// From the first message to the last [s].
+    /// From the first message to the last, in seconds.
     pub duration_s: f64,
     /// Its topics, by name.
     pub topics: Vec<TopicInfo>,

@@ -3,6 +3,7 @@
 //! A bag is a folder with `metadata.yaml` and `NAME_0.mcap`, as `ros2 bag` writes it. While it is written it is
 //! called `NAME.partial`, so that a folder with the bag's own name is always whole.
 
+mod definition;
 mod demonstration;
 mod error;
 mod info;
@@ -14,6 +15,7 @@ mod sqlite;
 mod verify;
 mod writer;
 
+pub use definition::installed_definition;
 pub use demonstration::{Demonstration, DemonstrationError, DemonstrationStep};
 pub use error::BagError;
 pub use info::{BagInfo, FileInfo, RunInfo, TopicInfo, outcome_name};

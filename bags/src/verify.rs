@@ -98,9 +98,9 @@ pub struct VerifiedTopic {
     pub messages: u64,
     /// Messages that the recorder's numbers say are missing; 0 also for recorders that count nothing.
     pub missing: u64,
-    /// Longest time without a message between its first and its last [s].
+    /// Longest time without a message between its first and its last, in seconds.
     pub longest_gap_s: f64,
-    /// When that began, since the clock's zero [s].
+    /// When that began, since the clock's zero, in seconds.
     pub longest_gap_at_s: f64,
 }
 

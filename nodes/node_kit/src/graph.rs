@@ -8,13 +8,13 @@ use std::{
     time::{Duration, Instant},
 };
 
-use rustdds::{DomainParticipant, GUID, QosPolicies, RTPSEntity};
+use rustdds::{DomainParticipant, GUID, QosPolicies, RTPSEntity, discovery::DiscoveredWriterData};
 
 use crate::{service::CallError, statistics::Direction};
 
 /// The type with which ros2-client subscribes to `/clock`.
 const CLOCK_OF_ROS2_CLIENT: &str = "builtin_interfaces::msg::dds_::Time_";
-const POLL_PERIOD: Duration = Duration::from_millis(20);
+pub(crate) const POLL_PERIOD: Duration = Duration::from_millis(20);
 
 /// The ROS graph as one node has discovered it, without its own endpoints.
 #[derive(Clone)]
@@ -113,6 +113,14 @@ impl Graph {
             }
         }
         conflicts
+    }
+
+    /// Publishers of other participants, services included.
+    pub(crate) fn discovered_writers(&self) -> Vec<DiscoveredWriterData> {
+        let own = self.participant.guid().prefix;
+        let mut writers = self.participant.discovered_writers();
+        writers.retain(|writer| writer.writer_proxy.remote_writer_guid.prefix != own);
+        writers
     }
 
     async fn wait(&self, limit: Duration, condition: impl Fn() -> bool) -> bool {

@@ -29,6 +29,7 @@ use crate::{
     graph::{Conflict, Endpoint, Graph},
     logging,
     qos::Qos,
+    raw::{self, RawPublisher, RawQos, RawSubscription},
     service::{ServiceClient, ServiceServer},
     statistics::{Direction, Statistics},
     topic::{Publisher, Subscription},
@@ -298,6 +299,81 @@ impl Node {
             inner,
             self.statistics(&name, Direction::In),
         ))
+    }
+
+    /// Publishes a topic of any type (its full ROS name, for instance `std_msgs/msg/String`).
+    pub fn raw_publisher(
+        &self,
+        topic: &str,
+        type_name: &str,
+        qos: RawQos,
+    ) -> Result<RawPublisher, NodeError> {
+        let (name, topic) = self.raw_topic(topic, type_name, qos)?;
+        let middleware = |error: rustdds::dds::result::CreateError| {
+            NodeError::middleware("publisher", &name, format!("{error:?}"))
+        };
+        let participant = self.inner.context.domain_participant();
+        let publisher = participant
+            .create_publisher(&qos.policies())
+            .map_err(middleware)?;
+        let writer = publisher
+            .create_datawriter_no_key(&topic, Some(qos.policies()))
+            .map_err(middleware)?;
+        Ok(RawPublisher::new(
+            writer,
+            self.statistics(&name, Direction::Out),
+        ))
+    }
+
+    /// Subscribes to a topic of any type.
+    pub fn raw_subscription(
+        &self,
+        topic: &str,
+        type_name: &str,
+        qos: RawQos,
+    ) -> Result<RawSubscription, NodeError> {
+        let (name, topic) = self.raw_topic(topic, type_name, qos)?;
+        let middleware = |error: rustdds::dds::result::CreateError| {
+            NodeError::middleware("subscription", &name, format!("{error:?}"))
+        };
+        let participant = self.inner.context.domain_participant();
+        let subscriber = participant
+            .create_subscriber(&qos.policies())
+            .map_err(middleware)?;
+        let reader = subscriber
+            .create_simple_datareader_no_key(&topic, Some(qos.policies()))
+            .map_err(middleware)?;
+        Ok(RawSubscription::new(
+            reader,
+            subscriber,
+            self.statistics(&name, Direction::In),
+        ))
+    }
+
+    fn raw_topic(
+        &self,
+        name: &str,
+        type_name: &str,
+        qos: RawQos,
+    ) -> Result<(String, Topic), NodeError> {
+        let (full, _) = self.ros_name("topic", name)?;
+        let dds_type = raw::dds_type_name(type_name).ok_or_else(|| NodeError::Name {
+            what: "type",
+            name: type_name.to_owned(),
+            reason: "expected PACKAGE/msg/NAME".to_owned(),
+        })?;
+        let topic = self
+            .inner
+            .context
+            .domain_participant()
+            .create_topic(
+                format!("rt{full}"),
+                dds_type,
+                &qos.policies(),
+                TopicKind::NoKey,
+            )
+            .map_err(|error| NodeError::middleware("topic", &full, format!("{error:?}")))?;
+        Ok((full, topic))
     }
 
     /// Answers a service.

@@ -7,6 +7,7 @@ mod evaluate;
 mod gallery;
 mod launch;
 mod picture;
+mod plain_node;
 mod progress;
 mod root;
 mod train;

@@ -1,4 +1,8 @@
-//! `sctn bag`: looks into bags, checks and repairs them.
+//! `sctn bag`: records, plays, looks into, checks and repairs bags.
+
+mod play;
+mod record;
+pub mod recorder;
 
 use anyhow::{Context, Result};
 use bags::{BagInfo, Compression, Findings, recover, verify};
@@ -12,7 +16,7 @@ pub const DAMAGED: u8 = 3;
 /// Findings that are shown to a person; `--json` has more.
 const SHOWN: usize = 20;
 
-/// Bags: what is inside, whether they are whole, a repaired copy
+/// Record, play, look into, check and repair bags
 ///
 /// Exit codes: 0 done and whole; 1 could not be done; 2 wrong command line; 3 damaged, or something is missing.
 #[derive(Args)]
@@ -23,6 +27,10 @@ pub struct Bag {
 
 #[derive(Subcommand)]
 enum Command {
+    /// Record topics of any type; exit code 3 if messages were lost on the way to the disk, or it was full
+    Record(record::Record),
+    /// Publish what was recorded, at the recorded pace and quality of service
+    Play(play::Play),
     /// Show files, topics, types, counts, steps and rewards
     Info(Info),
     /// Check every byte: framing, checksums, indices, counts; exit code 3 if it is not whole
@@ -85,6 +93,8 @@ impl From<CompressionName> for Compression {
 impl Bag {
     pub fn run(self) -> Result<ExitCode> {
         match self.command {
+            Command::Record(record) => record.run(),
+            Command::Play(play) => play.run(),
             Command::Info(info) => info.run(),
             Command::Verify(verify) => verify.run(),
             Command::Recover(recover) => recover.run(),

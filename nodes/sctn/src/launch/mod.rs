@@ -2,9 +2,10 @@
 
 mod graph;
 mod operator;
-mod recorder;
+mod recording;
 
 use crate::demos::demonstration;
+use crate::plain_node::plain_node;
 use crate::root::Root;
 use anyhow::{Context as _, Result, bail};
 use bags::outcome_name;
@@ -14,12 +15,10 @@ use heightmap::Heightmap;
 use msgs::convert::heightmap_from_msg;
 use msgs::sctn_msgs::{Goal, PickPlace, Reward, StepConfirmation, StepResult};
 use multiravens::Environment;
-use node_kit::{
-    Context, Network, Node, Parameters, Qos, RosArguments, ns_from_stamp, wait_for_end,
-};
+use node_kit::{Node, Qos, ns_from_stamp, wait_for_end};
 use operator::{Operator, OperatorKind, Question, automatic};
-use recorder::Recorder;
-use serde::{Deserialize, Serialize};
+use recording::RunRecorder;
+use serde::Serialize;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
 
@@ -56,13 +55,6 @@ pub struct Launch {
     #[arg(long)]
     json: bool,
 }
-
-/// The node of this command has no parameters of its own.
-#[derive(Default, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-struct NoParameters {}
-
-impl Parameters for NoParameters {}
 
 /// How a run ended.
 #[derive(Debug, Serialize)]
@@ -149,14 +141,13 @@ impl Launch {
         folder: &Path,
         max_steps: usize,
     ) -> Result<Report> {
-        let context = Context::new(Network::from_environment()?);
-        let (node, _) = context.node::<NoParameters>("sctn_launch", &RosArguments::default())?;
         // Subscriptions stand before the nodes start: nothing of the run is missed.
         let recorder = self
             .record
             .as_ref()
-            .map(|_| Recorder::start(&node, &folder.join("run"), self.record_images))
+            .map(|_| RunRecorder::start(&folder.join("run"), settings, self.record_images))
             .transpose()?;
+        let (context, node) = plain_node("sctn_launch", &[])?;
         let mut desk = Desk::new(&node)?;
         let mut graph = if self.processes {
             Graph::spawn(root, settings, &folder.join("logs"))?
@@ -170,7 +161,7 @@ impl Launch {
         };
         graph.stop(&context).await;
         let bag = match recorder {
-            Some(recorder) => Some(recorder.finish().await?),
+            Some(recorder) => Some(recorder.finish().await?.bag),
             None => None,
         };
         if let Some(heightmap) = desk.last_heightmap()?

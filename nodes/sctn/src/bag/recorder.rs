@@ -1,0 +1,580 @@
+//! Records topics of any type as a bag: `sctn bag record` and `sctn launch --record`.
+
+use anyhow::{Context as _, Result, anyhow};
+use bags::{BagError, BagWriter, Qos, Stamps, TopicHandle, WriteOptions};
+use msgs::Interface;
+use msgs::sctn_msgs::{Reward, StepConfirmation, StepResult};
+use node_kit::{Node, Offer, RawQos};
+use regex::RegexSet;
+use serde::Serialize;
+use std::collections::{BTreeMap, BTreeSet};
+use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering::Relaxed};
+use std::sync::{Arc, Mutex, MutexGuard, PoisonError, mpsc};
+use std::thread::JoinHandle;
+use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
+
+/// How often discovery is asked for new topics.
+const LOOK_EVERY: Duration = Duration::from_millis(100);
+/// How often what has come is closed off, so that it survives the end of the process.
+const FLUSH_EVERY: Duration = Duration::from_secs(1);
+/// The moments after which a crash must lose nothing of a step.
+const FLUSHED_AT_ONCE: [&str; 3] = [
+    StepConfirmation::TYPE_NAME,
+    StepResult::TYPE_NAME,
+    Reward::TYPE_NAME,
+];
+/// Messages of these types are large: RustDDS keeps as many as the depth says, also those that were taken.
+const LARGE: [&str; 3] = [
+    "sensor_msgs/msg/Image",
+    "sensor_msgs/msg/PointCloud2",
+    "sensor_msgs/msg/CompressedImage",
+];
+
+/// How to record.
+#[derive(Clone, Copy, Debug)]
+pub struct RecorderOptions {
+    /// How the bag is written.
+    pub write: WriteOptions,
+    /// Bytes that may wait for the disk; what comes beyond is lost and counted.
+    pub queue_bytes: usize,
+    /// The recording ends before less room than this is left on the disk.
+    pub min_free_bytes: u64,
+    /// Log times come from `/clock`, else from the system's.
+    pub use_sim_time: bool,
+}
+
+impl Default for RecorderOptions {
+    fn default() -> Self {
+        Self {
+            write: WriteOptions::default(),
+            queue_bytes: 128 << 20,
+            min_free_bytes: 64 << 20,
+            use_sim_time: false,
+        }
+    }
+}
+
+/// Which topics to record.
+#[derive(Debug, Default)]
+pub struct Selection {
+    /// Every topic but the hidden ones.
+    pub all: bool,
+    /// Absolute names.
+    pub names: BTreeSet<String>,
+    /// Names that match one of these.
+    pub patterns: RegexSet,
+    /// Names that match one of these are left out, whatever else selects them.
+    pub exclude: RegexSet,
+    /// Also names with a part that begins with an underscore.
+    pub hidden: bool,
+}
+
+impl Selection {
+    fn contains(&self, topic: &str) -> bool {
+        let hidden = topic.split('/').any(|part| part.starts_with('_'));
+        let selected = self.names.contains(topic)
+            || ((self.all || self.patterns.is_match(topic)) && (self.hidden || !hidden));
+        selected && !self.exclude.is_match(topic)
+    }
+}
+
+/// What was recorded of a topic.
+#[derive(Clone, Debug, Default, PartialEq, Eq, Serialize)]
+pub struct TopicCount {
+    /// Messages that were received and handed on to the disk.
+    pub messages: u64,
+    /// Messages whose numbers say that they were sent and never arrived.
+    pub lost_in_transport: u64,
+    /// Messages that arrived while the queue to the disk was full.
+    pub lost_in_queue: u64,
+}
+
+/// Why a recording ended by itself.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum End {
+    /// It was asked to.
+    Asked,
+    /// There was hardly any room left on the disk.
+    DiskFull,
+}
+
+/// What came of a recording.
+#[derive(Clone, Debug, Serialize)]
+pub struct Recording {
+    /// The bag.
+    pub bag: PathBuf,
+    /// Why it ended.
+    pub end: End,
+    /// Messages in it.
+    pub messages: u64,
+    /// Bytes of its files.
+    pub bytes: u64,
+    /// Its files.
+    pub files: usize,
+    /// Its topics.
+    pub topics: BTreeMap<String, TopicCount>,
+}
+
+impl Recording {
+    /// Messages that arrived and are not in the bag.
+    pub fn lost_in_queue(&self) -> u64 {
+        self.topics.values().map(|topic| topic.lost_in_queue).sum()
+    }
+}
+
+/// How far a recording is.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Progress {
+    /// Messages received.
+    pub messages: u64,
+    /// Their bytes.
+    pub bytes: u64,
+    /// Messages lost in the transport.
+    pub lost_in_transport: u64,
+    /// Messages lost in the queue.
+    pub lost_in_queue: u64,
+}
+
+/// On its way to the disk.
+enum Entry {
+    Topic {
+        index: usize,
+        name: String,
+        type_name: String,
+        offered: Vec<Qos>,
+    },
+    Note(&'static str, String),
+    Message {
+        index: usize,
+        stamps: Stamps,
+        data: Vec<u8>,
+        flush: bool,
+    },
+}
+
+/// What tasks and the writing thread share.
+#[derive(Default)]
+struct Shared {
+    queued_bytes: AtomicUsize,
+    received_bytes: AtomicU64,
+    counts: Mutex<Vec<(String, TopicCount)>>,
+    ended: AtomicBool,
+}
+
+impl Shared {
+    fn counts(&self) -> MutexGuard<'_, Vec<(String, TopicCount)>> {
+        self.counts.lock().unwrap_or_else(PoisonError::into_inner)
+    }
+}
+
+/// A topic that is being recorded.
+struct Followed {
+    type_name: String,
+    index: usize,
+    asked: RawQos,
+    task: tokio::task::AbortHandle,
+}
+
+/// Subscribes to topics; one thread writes what arrives.
+pub struct Recorder {
+    node: Node,
+    path: PathBuf,
+    options: RecorderOptions,
+    shared: Arc<Shared>,
+    queue: mpsc::Sender<Entry>,
+    writer: JoinHandle<Result<Written>>,
+    followed: BTreeMap<String, Followed>,
+    /// Topics that cannot be recorded, warned about once.
+    refused: BTreeSet<String>,
+}
+
+struct Written {
+    bag: BagWriter,
+    end: End,
+}
+
+impl Recorder {
+    /// Begins a bag. The node hears every participant but its own.
+    pub fn start(node: &Node, path: &Path, options: RecorderOptions) -> Result<Self> {
+        let bag = BagWriter::create(path, options.write).context("begin the bag")?;
+        let shared = Arc::new(Shared::default());
+        let (queue, entries) = mpsc::channel();
+        let writing = Writing {
+            bag,
+            handles: Vec::new(),
+            shared: Arc::clone(&shared),
+            min_free_bytes: options.min_free_bytes,
+        };
+        let span = node.span().clone();
+        let writer = std::thread::Builder::new()
+            .name("recorder".into())
+            .spawn(move || {
+                let ended = Arc::clone(&writing.shared);
+                let result = span.in_scope(|| writing.run(&entries));
+                ended.ended.store(true, Relaxed);
+                result
+            })?;
+        Ok(Self {
+            node: node.clone(),
+            path: path.to_owned(),
+            options,
+            shared,
+            queue,
+            writer,
+            followed: BTreeMap::new(),
+            refused: BTreeSet::new(),
+        })
+    }
+
+    /// Notes a fact about the whole bag.
+    pub fn note(&self, key: &'static str, value: impl ToString) {
+        let _ = self.queue.send(Entry::Note(key, value.to_string()));
+    }
+
+    /// Records a topic from now on, before anybody publishes it, so that nothing of it is missed.
+    pub fn expect(&mut self, topic: &str, type_name: &str, offered: Qos) -> Result<()> {
+        let name = self.node.resolve(topic);
+        self.record(&name, type_name, &[offered])
+    }
+
+    /// Looks for topics as they appear, until the writing ends.
+    pub async fn follow(&mut self, selection: &Selection) -> Result<()> {
+        while !self.shared.ended.load(Relaxed) {
+            self.look(selection)?;
+            tokio::time::sleep(LOOK_EVERY).await;
+        }
+        Ok(())
+    }
+
+    fn look(&mut self, selection: &Selection) -> Result<()> {
+        let mut offers: BTreeMap<String, Vec<Offer>> = BTreeMap::new();
+        for offer in self.node.graph().offers() {
+            if self.followed.contains_key(&offer.topic) || selection.contains(&offer.topic) {
+                offers.entry(offer.topic.clone()).or_default().push(offer);
+            }
+        }
+        for (topic, offers) in offers {
+            let type_name = match self.followed.get(&topic) {
+                Some(followed) => followed.type_name.clone(),
+                None => offers[0].type_name.clone(),
+            };
+            let (same, other): (Vec<&Offer>, Vec<&Offer>) = offers
+                .iter()
+                .partition(|offer| offer.type_name == type_name);
+            if let Some(other) = other.first()
+                && self.refused.insert(format!("{topic} {}", other.type_name))
+            {
+                tracing::warn!(
+                    "{topic}: messages of type {} are not recorded, as the topic has type {type_name}",
+                    other.type_name
+                );
+            }
+            let mut offered: Vec<Qos> = same.iter().map(|offer| qos(offer.qos)).collect();
+            offered.sort();
+            offered.dedup();
+            if offered.is_empty() || self.refused.contains(&topic) {
+                continue;
+            }
+            if let Err(error) = self.record(&topic, &type_name, &offered) {
+                tracing::warn!("{topic} is not recorded: {error:#}");
+                self.refused.insert(topic);
+            }
+        }
+        Ok(())
+    }
+
+    /// Subscribes with the least that all publishers offer; again where a new one offers less.
+    fn record(&mut self, topic: &str, type_name: &str, offered: &[Qos]) -> Result<()> {
+        let asked = RawQos {
+            reliable: offered.iter().all(|qos| qos.reliable),
+            transient_local: offered.iter().all(|qos| qos.transient_local),
+            depth: if LARGE.contains(&type_name) { 16 } else { 256 },
+        };
+        let index = match self.followed.get(topic) {
+            Some(followed)
+                if followed.asked.reliable <= asked.reliable
+                    && followed.asked.transient_local <= asked.transient_local =>
+            {
+                return Ok(());
+            }
+            Some(followed) => {
+                tracing::info!("{topic}: a publisher offers less than before, subscribing again");
+                followed.task.abort();
+                followed.index
+            }
+            None => {
+                let mut counts = self.shared.counts();
+                counts.push((topic.to_owned(), TopicCount::default()));
+                let entry = Entry::Topic {
+                    index: counts.len() - 1,
+                    name: topic.to_owned(),
+                    type_name: type_name.to_owned(),
+                    offered: offered.to_vec(),
+                };
+                // The writing has ended: its reason comes out at the end.
+                let _ = self.queue.send(entry);
+                counts.len() - 1
+            }
+        };
+        let mut subscription = self.node.raw_subscription(topic, type_name, asked)?;
+        let shared = Arc::clone(&self.shared);
+        let queue = self.queue.clone();
+        let limit = self.options.queue_bytes;
+        let flush = FLUSHED_AT_ONCE.contains(&type_name);
+        let clock = self.options.use_sim_time.then(|| self.node.clock().clone());
+        let task = self.node.spawn(async move {
+            let mut sequence = shared.counts()[index].1.sequence();
+            loop {
+                let message = subscription.recv().await;
+                let now = match &clock {
+                    Some(clock) => Duration::from_nanos(clock.now_ns().max(0) as u64),
+                    None => SystemTime::now()
+                        .duration_since(UNIX_EPOCH)
+                        .unwrap_or_default(),
+                };
+                let length = message.data.len();
+                let full = shared.queued_bytes.load(Relaxed) + length > limit;
+                {
+                    let count = &mut shared.counts()[index].1;
+                    count.lost_in_transport += message.lost_before;
+                    if full {
+                        count.lost_in_queue += 1;
+                    } else {
+                        count.messages += 1;
+                    }
+                }
+                sequence += message.lost_before + 1;
+                if full {
+                    continue;
+                }
+                shared.queued_bytes.fetch_add(length, Relaxed);
+                shared.received_bytes.fetch_add(length as u64, Relaxed);
+                let stamps = Stamps {
+                    // A gap in the bag says that messages are missing.
+                    sequence: (sequence - 1) as u32,
+                    log_time: now,
+                    publish_time: message.sent_ns.map_or(now, Duration::from_nanos),
+                };
+                let entry = Entry::Message {
+                    index,
+                    stamps,
+                    data: message.data,
+                    flush,
+                };
+                if queue.send(entry).is_err() {
+                    return;
+                }
+            }
+        });
+        let followed = Followed {
+            type_name: type_name.to_owned(),
+            index,
+            asked,
+            task: task.abort_handle(),
+        };
+        self.followed.insert(topic.to_owned(), followed);
+        Ok(())
+    }
+
+    /// How far it is.
+    pub fn progress(&self) -> Progress {
+        let mut progress = Progress {
+            bytes: self.shared.received_bytes.load(Relaxed),
+            ..Progress::default()
+        };
+        for (_, count) in self.shared.counts().iter() {
+            progress.messages += count.messages;
+            progress.lost_in_transport += count.lost_in_transport;
+            progress.lost_in_queue += count.lost_in_queue;
+        }
+        progress
+    }
+
+    /// Stops listening, writes what has come, and gives the bag its name.
+    pub async fn finish(self) -> Result<Recording> {
+        let Self {
+            path,
+            shared,
+            queue,
+            writer,
+            followed,
+            ..
+        } = self;
+        for topic in followed.values() {
+            topic.task.abort();
+        }
+        // The thread ends when all senders are gone: those of the tasks go with them.
+        drop(queue);
+        let written = tokio::task::spawn_blocking(move || writer.join())
+            .await?
+            .map_err(|_| anyhow!("the recorder's thread panicked"))?;
+        let Written { mut bag, end } = written.with_context(|| {
+            let partial = bags::partial_path(&path);
+            format!(
+                "record {}; what was written until then is in {}: sctn bag recover",
+                path.display(),
+                partial.display()
+            )
+        })?;
+        bag.flush().context("complete the bag")?;
+        let (messages, bytes, files) = (bag.message_count(), bag.bytes()?, bag.file_count());
+        tokio::task::spawn_blocking(move || bag.finish())
+            .await?
+            .context("complete the bag")?;
+        Ok(Recording {
+            bag: path,
+            end,
+            messages,
+            bytes,
+            files,
+            topics: shared.counts().iter().cloned().collect(),
+        })
+    }
+}
+
+impl TopicCount {
+    /// Number of the next message.
+    fn sequence(&self) -> u64 {
+        self.messages + self.lost_in_transport + self.lost_in_queue
+    }
+}
+
+fn qos(offer: RawQos) -> Qos {
+    Qos {
+        reliable: offer.reliable,
+        transient_local: offer.transient_local,
+        depth: if offer.transient_local { 1 } else { 10 },
+    }
+}
+
+/// The thread that owns the bag.
+struct Writing {
+    bag: BagWriter,
+    handles: Vec<Option<TopicHandle>>,
+    shared: Arc<Shared>,
+    min_free_bytes: u64,
+}
+
+impl Writing {
+    fn run(mut self, entries: &mpsc::Receiver<Entry>) -> Result<Written> {
+        let mut flushed = Instant::now();
+        let mut unflushed = false;
+        loop {
+            if unflushed && flushed.elapsed() >= FLUSH_EVERY {
+                self.bag.flush()?;
+                (flushed, unflushed) = (Instant::now(), false);
+                if self.is_disk_full()? {
+                    return self.end(End::DiskFull);
+                }
+            }
+            let entry = match entries.recv_timeout(FLUSH_EVERY) {
+                Ok(entry) => entry,
+                Err(mpsc::RecvTimeoutError::Timeout) => continue,
+                Err(mpsc::RecvTimeoutError::Disconnected) => return self.end(End::Asked),
+            };
+            match entry {
+                Entry::Topic {
+                    index,
+                    name,
+                    type_name,
+                    offered,
+                } => {
+                    let handle = self.add(&name, &type_name, &offered)?;
+                    self.handles.resize(self.handles.len().max(index + 1), None);
+                    self.handles[index] = Some(handle);
+                }
+                Entry::Note(key, value) => self.bag.note(key, value),
+                Entry::Message {
+                    index,
+                    stamps,
+                    data,
+                    flush,
+                } => {
+                    self.shared.queued_bytes.fetch_sub(data.len(), Relaxed);
+                    let handle = self.handles.get(index).copied().flatten();
+                    let handle = handle.context("a message of a topic that was not announced")?;
+                    self.bag.write_stamped(handle, stamps, &data)?;
+                    unflushed = !flush;
+                    if flush {
+                        self.bag.flush()?;
+                        flushed = Instant::now();
+                    }
+                }
+            }
+        }
+    }
+
+    fn add(
+        &mut self,
+        name: &str,
+        type_name: &str,
+        offered: &[Qos],
+    ) -> Result<TopicHandle, BagError> {
+        if let Some(description) = msgs::description(type_name) {
+            return self.bag.add_topic(name, description, offered);
+        }
+        let definition = bags::installed_definition(type_name).unwrap_or_default();
+        if definition.is_empty() {
+            tracing::warn!(
+                "{name}: the definition of {type_name} is unknown (it is in no folder of AMENT_PREFIX_PATH); the bag holds \
+                 the messages without it"
+            );
+        } else {
+            tracing::debug!("{name}: {type_name}");
+        }
+        self.bag
+            .add_raw_topic(name, type_name, &definition, "", offered)
+    }
+
+    fn is_disk_full(&self) -> Result<bool> {
+        let partial = self.bag.partial();
+        let disk = rustix::fs::statvfs(partial).with_context(|| partial.display().to_string())?;
+        Ok(disk.f_bavail.saturating_mul(disk.f_frsize) < self.min_free_bytes)
+    }
+
+    fn end(self, end: End) -> Result<Written> {
+        if end == End::DiskFull {
+            tracing::error!("hardly any room is left on the disk: the recording ends here");
+        }
+        Ok(Written { bag: self.bag, end })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn topics_are_selected_by_name_pattern_and_exclusion() {
+        let patterns = |patterns: &[&str]| RegexSet::new(patterns).unwrap();
+        let selection = Selection {
+            names: BTreeSet::from(["/goal".to_owned()]),
+            patterns: patterns(&["^/(front|left)/"]),
+            exclude: patterns(&["depth"]),
+            ..Selection::default()
+        };
+        for (topic, expected) in [
+            ("/goal", true),
+            ("/goals", false),
+            ("/front/color/image_raw", true),
+            ("/front/depth/image_raw", false),
+            ("/right/color/image_raw", false),
+            ("/left/_hidden", false),
+        ] {
+            assert_eq!(selection.contains(topic), expected, "{topic}");
+        }
+        let all = Selection {
+            all: true,
+            ..Selection::default()
+        };
+        assert!(all.contains("/anything/at/all"));
+        assert!(!all.contains("/_hidden"));
+        let hidden = Selection {
+            hidden: true,
+            ..all
+        };
+        assert!(hidden.contains("/_hidden"));
+    }
+}

@@ -1,0 +1,72 @@
+//! What `sctn launch` records of a run.
+
+use crate::bag::recorder::{Recorder, RecorderOptions, Recording};
+use crate::launch::graph::Settings;
+use crate::plain_node::plain_node;
+use anyhow::Result;
+use bags::Qos;
+use msgs::Interface;
+use msgs::rosgraph_msgs::Clock;
+use msgs::sctn_msgs::{Goal, Heightmap, PickPlace, Reward, StepConfirmation, StepResult};
+use msgs::sensor_msgs::{CameraInfo, Image, JointState};
+use msgs::tf2_msgs::TFMessage;
+use node_kit::Context;
+use std::path::Path;
+use std::time::Duration;
+
+const CAMERAS: [&str; 3] = ["front", "left", "right"];
+/// What was sent last may still be on its way.
+const LAST_WORDS: Duration = Duration::from_millis(300);
+
+const TOPICS: [(&str, &str, Qos); 9] = [
+    ("heightmap", Heightmap::TYPE_NAME, Qos::LATCHED),
+    ("goal", Goal::TYPE_NAME, Qos::LATCHED),
+    ("pick_place", PickPlace::TYPE_NAME, Qos::LATCHED),
+    (
+        "step_confirmation",
+        StepConfirmation::TYPE_NAME,
+        Qos::RELIABLE,
+    ),
+    ("step_result", StepResult::TYPE_NAME, Qos::RELIABLE),
+    ("reward", Reward::TYPE_NAME, Qos::RELIABLE),
+    ("joint_states", JointState::TYPE_NAME, Qos::RELIABLE),
+    ("/tf_static", TFMessage::TYPE_NAME, Qos::LATCHED),
+    ("/clock", Clock::TYPE_NAME, Qos::BEST_EFFORT),
+];
+
+/// A run that is being recorded, by a node of its own: so it hears the operator of this command too.
+pub struct RunRecorder {
+    context: Context,
+    recorder: Recorder,
+}
+
+impl RunRecorder {
+    /// Begins a bag; `images` also records what the cameras send.
+    pub fn start(path: &Path, settings: &Settings, images: bool) -> Result<Self> {
+        let (context, node) = plain_node("sctn_recorder", &[])?;
+        let mut recorder = Recorder::start(&node, path, RecorderOptions::default())?;
+        recorder.note("problem", &settings.problem);
+        recorder.note("seed", settings.seed);
+        for (topic, type_name, offered) in TOPICS {
+            recorder.expect(topic, type_name, offered)?;
+        }
+        for camera in CAMERAS.into_iter().filter(|_| images) {
+            for (topic, type_name) in [
+                ("color/image_raw", Image::TYPE_NAME),
+                ("depth/image_rect_raw", Image::TYPE_NAME),
+                ("color/camera_info", CameraInfo::TYPE_NAME),
+            ] {
+                recorder.expect(&format!("{camera}/{topic}"), type_name, Qos::BEST_EFFORT)?;
+            }
+        }
+        Ok(Self { context, recorder })
+    }
+
+    /// Completes the bag.
+    pub async fn finish(self) -> Result<Recording> {
+        tokio::time::sleep(LAST_WORDS).await;
+        let recording = self.recorder.finish().await;
+        self.context.shutdown();
+        recording
+    }
+}

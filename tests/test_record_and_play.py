@@ -1,0 +1,179 @@
+"""`sctn bag record` and `play` beside rclpy: any type, found as it appears; nothing of a step is lost by kill -9."""
+
+from __future__ import annotations
+
+import json
+import pathlib
+import random
+import signal
+import time
+
+import pytest
+import yaml
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rosbags.highlevel import AnyReader
+from rosbags.typesys import Stores, get_typestore
+from sctn_msgs.msg import StepResult
+from sensor_msgs.msg import BatteryState
+from std_msgs.msg import String
+
+from cell_operator import EVENT, LATCHED, Operator
+
+STORE = get_typestore(Stores.ROS2_JAZZY)
+# Many messages in a short time: none may fall out of a reader's history.
+DEEP = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.VOLATILE)
+KILLS = 10
+# What was published so long before the kill has to be in the bag: transport and one flush.
+SETTLED_S = 0.3
+
+
+def contents(bag: pathlib.Path, *topics: str) -> list[tuple[str, object]]:
+    """Topic and deserialised message, in the order of the bag, by rosbags."""
+    with AnyReader([bag], default_typestore=STORE) as reader:
+        chosen = [connection for connection in reader.connections if not topics or connection.topic in topics]
+        return [(c.topic, reader.deserialize(raw, c.msgtype)) for c, _, raw in reader.messages(chosen)]
+
+
+def wait_for_recorder(operator: Operator, *publishers) -> None:
+    operator.until(lambda: all(p.get_subscription_count() >= 1 for p in publishers), "recorder that listens", 30.0)
+
+
+def end(recorder, code: int = 0) -> dict:
+    """Ends a recorder as Ctrl+C does; its report."""
+    recorder.signal(signal.SIGINT)
+    assert recorder.wait(30.0) == code, recorder.log()
+    return json.loads(recorder.output().splitlines()[-1])
+
+
+def test_topics_of_any_type_are_recorded_as_they_appear_and_read_by_rosbags(
+    start, operator: Operator, tmp_path: pathlib.Path
+) -> None:
+    bag = tmp_path / "bag"
+    recorder = start("sctn", "bag", "record", "--all", "--exclude", "hush", "--out", bag, "--json")
+    operator.spin(1.0)
+    node = operator.node
+    latched = node.create_publisher(String, "/latched", LATCHED)
+    # A type that is not among ours: its definition comes from the ROS install.
+    batteries = node.create_publisher(BatteryState, "/cell/battery", DEEP)
+    hush = node.create_publisher(String, "/hush", DEEP)
+    latched.publish(String(data="before anybody listened"))
+    wait_for_recorder(operator, latched, batteries)
+    for index in range(200):
+        batteries.publish(BatteryState(voltage=float(index), location=f"slot {index}", cell_voltage=[1.0, float(index)]))
+        hush.publish(String(data="not for the bag"))
+        operator.spin(0.002)
+    operator.spin(1.0)
+    report = end(recorder)
+    assert report["topics"]["/cell/battery"] == {"messages": 200, "lost_in_transport": 0, "lost_in_queue": 0}
+
+    found = contents(bag, "/cell/battery")
+    assert [battery.location for _, battery in found] == [f"slot {index}" for index in range(200)]
+    assert [list(battery.cell_voltage) for _, battery in found] == [[1.0, float(index)] for index in range(200)]
+    assert [text.data for _, text in contents(bag, "/latched")] == ["before anybody listened"]
+    information = yaml.safe_load((bag / "metadata.yaml").read_text())["rosbag2_bagfile_information"]
+    topics = {entry["topic_metadata"]["name"]: entry for entry in information["topics_with_message_count"]}
+    assert "/hush" not in topics
+    (qos,) = topics["/latched"]["topic_metadata"]["offered_qos_profiles"]
+    assert (qos["reliability"], qos["durability"]) == ("reliable", "transient_local")
+    assert start("sctn", "bag", "verify", bag).wait(30.0) == 0
+
+
+def test_a_recording_is_split_and_played_as_one(start, operator: Operator, tmp_path: pathlib.Path) -> None:
+    bag = tmp_path / "bag"
+    recorder = start("sctn", "bag", "record", "/chatter", "--out", bag, "--split-duration", 1.0, "--compression", "none", "--json")
+    chatter = operator.node.create_publisher(String, "/chatter", DEEP)
+    wait_for_recorder(operator, chatter)
+    for index in range(60):
+        chatter.publish(String(data=str(index)))
+        operator.spin(0.05)
+    operator.spin(0.5)
+    report = end(recorder)
+    assert report["files"] >= 3
+    assert len(list(bag.glob("*.mcap"))) == report["files"]
+    assert [int(text.data) for _, text in contents(bag)] == list(range(60))
+
+    heard: list[String] = []
+    operator.node.create_subscription(String, "/elsewhere", heard.append, DEEP)
+    play = start(
+        "sctn", "bag", "play", bag, "--remap", "/chatter:=/elsewhere", "--rate", 4, "--wait", 30, "--start", 1.0, "--json"
+    )
+    operator.until(lambda: heard, "played message", 30.0)
+    first = time.monotonic()
+    operator.until(lambda: play.exit_code is not None, "end of the play", 30.0)
+    assert play.exit_code == 0, play.log()
+    operator.spin(0.5)
+    numbers = [int(text.data) for text in heard]
+    # From one second on, each message once and in order.
+    assert 5 < numbers[0] < 25
+    assert numbers == list(range(numbers[0], 60))
+    # Two seconds or so at four times the pace.
+    assert time.monotonic() - first < 0.6 * (60 - numbers[0]) * 0.05 + 3.0
+
+
+def test_a_bag_played_in_a_loop_ends_when_told(start, operator: Operator, tmp_path: pathlib.Path) -> None:
+    bag = tmp_path / "bag"
+    recorder = start("sctn", "bag", "record", "--regex", "^/chat", "--out", bag, "--json")
+    chatter = operator.node.create_publisher(String, "/chatter", DEEP)
+    wait_for_recorder(operator, chatter)
+    for index in range(5):
+        chatter.publish(String(data=str(index)))
+        operator.spin(0.05)
+    operator.spin(0.5)
+    end(recorder)
+    operator.node.destroy_publisher(chatter)
+    heard: list[String] = []
+    operator.node.create_subscription(String, "/chatter", heard.append, DEEP)
+    clocks = operator.count("clock")
+    play = start("sctn", "bag", "play", bag, "--loop", "--wait", 30, "--clock", 50)
+    operator.until(lambda: len(heard) >= 12, "message of the third round", 30.0)
+    assert [text.data for text in heard[:12]] == [str(index % 5) for index in range(12)]
+    assert operator.count("clock") > clocks
+    play.signal(signal.SIGTERM)
+    assert play.wait(30.0) == 0, play.log()
+
+
+def test_a_full_disk_ends_the_recording_and_what_was_written_is_a_bag(
+    start, operator: Operator, tmp_path: pathlib.Path
+) -> None:
+    bag = tmp_path / "bag"
+    # More room than any disk has.
+    recorder = start("sctn", "bag", "record", "/chatter", "--out", bag, "--min-free", 10**12, "--json")
+    chatter = operator.node.create_publisher(String, "/chatter", DEEP)
+    wait_for_recorder(operator, chatter)
+    chatter.publish(String(data="the last word"))
+    operator.until(lambda: recorder.exit_code is not None, "end of the recording", 30.0)
+    assert recorder.exit_code == 3, recorder.log()
+    assert json.loads(recorder.output().splitlines()[-1])["end"] == "disk_full"
+    assert "room" in recorder.errors()
+    assert [text.data for _, text in contents(bag)] == ["the last word"]
+
+
+@pytest.mark.parametrize("seed", range(KILLS))
+def test_a_killed_recorder_has_lost_no_step_whose_result_was_published(
+    start, operator: Operator, tmp_path: pathlib.Path, seed: int
+) -> None:
+    bag = tmp_path / "bag"
+    chance = random.Random(seed)
+    recorder = start("sctn", "bag", "record", "--all", "--out", bag)
+    results = operator.node.create_publisher(StepResult, "/killed/step_result", EVENT)
+    chatter = operator.node.create_publisher(String, "/killed/chatter", DEEP)
+    wait_for_recorder(operator, results, chatter)
+    kill_at = time.monotonic() + chance.uniform(0.5, 2.5)
+    published: list[tuple[float, int]] = []
+    while time.monotonic() < kill_at:
+        for _ in range(20):
+            chatter.publish(String(data="x" * chance.randrange(10_000)))
+        results.publish(StepResult(proposal_id=len(published), outcome=StepResult.PLACED))
+        published.append((time.monotonic(), len(published)))
+        operator.spin(0.01)
+    recorder.signal(signal.SIGKILL)
+    killed = time.monotonic()
+    recorder.wait(10.0)
+    copy = tmp_path / "copy"
+    recover = start("sctn", "bag", "recover", tmp_path / "bag.partial", "--out", copy)
+    assert recover.wait(30.0) == 3, recover.log()
+    saved = [result.proposal_id for _, result in contents(copy, "/killed/step_result")]
+    expected = [number for at, number in published if at < killed - SETTLED_S]
+    assert len(expected) > 3
+    assert saved[: len(expected)] == expected
+    assert start("sctn", "bag", "verify", copy).wait(30.0) == 0

@@ -33,7 +33,7 @@ impl Stage {
                 libtorch::set_up(&python::with_pip()?)?;
                 python::Environment::set_up().map(drop)
             }
-            Self::Fmt => run(cargo().args(["fmt", "--all", "--check"])),
+            Self::Fmt => run(cargo().args(["fmt", "--check"])),
             Self::Licences => licences::check(),
             Self::Clippy => run(cargo().args([
                 "clippy",

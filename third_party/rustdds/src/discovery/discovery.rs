@@ -1830,49 +1830,66 @@ impl Discovery {
   }
 
   fn add_local_writer(&self, guid: GUID) {
-    // Get writer data from db
-    let db = discovery_db_read(&self.discovery_db);
-    let writer_data = match db.get_local_topic_writer(guid) {
-      Some(d) => d,
-      None => {
-        warn!("Did not find a local writer {guid:?}");
-        return;
-      }
+    // Get writer data and existing readers from db. The guard must not be held
+    // below: publishing and sending wait for the event loop, which may itself be
+    // waiting for the db behind a thread that is creating an endpoint.
+    let (writer_data, existing_readers) = {
+      let db = discovery_db_read(&self.discovery_db);
+      let writer_data = match db.get_local_topic_writer(guid) {
+        Some(d) => d.clone(),
+        None => {
+          warn!("Did not find a local writer {guid:?}");
+          return;
+        }
+      };
+      let existing_readers: Vec<DiscoveredReaderData> = db
+        .readers_on_topic(writer_data.publication_topic_data.topic_name())
+        .into_iter()
+        .cloned()
+        .collect();
+      (writer_data, existing_readers)
     };
 
     // Publish it to SEDP (if needed)
-    self.sedp_publish_single_user_writer(writer_data);
+    self.sedp_publish_single_user_writer(&writer_data);
 
     // Send the ReaderUpdated notification on any existing readers on the writer's
     // topic This will result in matching the endpoints if possible
-    let existing_readers = db.readers_on_topic(writer_data.publication_topic_data.topic_name());
-    for reader in existing_readers {
+    for discovered_reader_data in existing_readers {
       self.send_discovery_notification(DiscoveryNotificationType::ReaderUpdated {
-        discovered_reader_data: reader.clone(),
+        discovered_reader_data,
       });
     }
   }
 
   fn add_local_reader(&self, guid: GUID) {
-    // Get reader data from db
-    let db = discovery_db_read(&self.discovery_db);
-    let reader_data = match db.get_local_topic_reader(guid) {
-      Some(d) => d,
-      None => {
-        warn!("Did not find a local reader {guid:?}");
-        return;
-      }
+    // Get reader data and existing writers from db. The guard must not be held
+    // below, see add_local_writer.
+    let (reader_data, existing_writers) = {
+      let db = discovery_db_read(&self.discovery_db);
+      let reader_data = match db.get_local_topic_reader(guid) {
+        Some(d) => d.clone(),
+        None => {
+          warn!("Did not find a local reader {guid:?}");
+          return;
+        }
+      };
+      let existing_writers: Vec<DiscoveredWriterData> = db
+        .writers_on_topic(reader_data.subscription_topic_data.topic_name())
+        .into_iter()
+        .cloned()
+        .collect();
+      (reader_data, existing_writers)
     };
 
     // Publish it to SEDP (if needed)
-    self.sedp_publish_single_user_reader(reader_data);
+    self.sedp_publish_single_user_reader(&reader_data);
 
     // Send the WriterUpdated notification on any existing writers on the readers's
     // topic This will result in matching the endpoints if possible
-    let existing_writers = db.writers_on_topic(reader_data.subscription_topic_data.topic_name());
-    for writer in existing_writers {
+    for discovered_writer_data in existing_writers {
       self.send_discovery_notification(DiscoveryNotificationType::WriterUpdated {
-        discovered_writer_data: writer.clone(),
+        discovered_writer_data,
       });
     }
   }
@@ -1930,11 +1947,14 @@ impl Discovery {
   }
 
   pub fn sedp_publish_topic(&self, topic_name: &str) {
-    let db = discovery_db_read(&self.discovery_db);
     // We might have multiple topics with the same name (but different Qos etc..),
     // and the following call gets just one of them. Should we publish all of
     // them or is this enough?
-    let topic_data = match db.get_topic(topic_name) {
+    // The guard must not be held while publishing, see add_local_writer.
+    let topic_data = discovery_db_read(&self.discovery_db)
+      .get_topic(topic_name)
+      .cloned();
+    let topic_data = match topic_data {
       Some(data) => data,
       None => {
         warn!("Did not find topic data with topic name {topic_name}");
@@ -1948,7 +1968,7 @@ impl Discovery {
       return;
     }
 
-    match self.dcps_topic.writer.write(topic_data.clone(), None) {
+    match self.dcps_topic.writer.write(topic_data, None) {
       Ok(()) => {
         debug!("Published topic {topic_name} to DCPSTopic");
       }

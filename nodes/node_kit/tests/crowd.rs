@@ -17,7 +17,7 @@ impl Parameters for NoParameters {}
 
 const NODES: usize = 8;
 const TOPICS: usize = 24;
-const ROUNDS: usize = 20;
+const ROUNDS: usize = 12;
 const PATIENCE: Duration = Duration::from_secs(30);
 
 /// A node that speaks and listens on all topics.

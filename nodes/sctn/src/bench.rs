@@ -1,6 +1,7 @@
 //! `sctn bench`: the inner loops, timed by criterion.
 
 use crate::demos::demonstration;
+use crate::latency::Chain;
 use crate::root::Root;
 use anyhow::{Context, Result, bail};
 use clap::Args;
@@ -87,6 +88,13 @@ const WORKLOADS: &[Workload] = &[
         original_s: Some(5.26),
         samples: 10,
         run: decision_resnet43,
+    },
+    Workload {
+        name: "frame_to_proposal",
+        threads: 1,
+        original_s: None,
+        samples: 10,
+        run: frame_to_proposal,
     },
 ];
 
@@ -262,4 +270,22 @@ fn decision(root: &Root, criterion: &mut Criterion, name: &str, policy: &Policy)
         b.iter(|| policy.decide(black_box(observation), goal, &[]))
     });
     Ok(())
+}
+
+/// Over DDS, from the last camera frame to the proposal, without what the network takes.
+fn frame_to_proposal(root: &Root, criterion: &mut Criterion, name: &str) -> Result<()> {
+    let mut chain = Chain::start(root, SEED)?;
+    chain.warm_up()?;
+    let mut failure = None;
+    criterion.bench_function(name, |b| {
+        b.iter_custom(|captures| {
+            let times = (0..captures).map(|_| chain.measure());
+            let total: Result<Duration> = times.sum();
+            total.unwrap_or_else(|error| {
+                failure = Some(error);
+                Duration::from_secs(1)
+            })
+        })
+    });
+    failure.map_or(Ok(()), Err)
 }

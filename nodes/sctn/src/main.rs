@@ -5,6 +5,7 @@ mod bench;
 mod demos;
 mod evaluate;
 mod gallery;
+mod latency;
 mod launch;
 mod picture;
 mod plain_node;

@@ -12,18 +12,15 @@ use node_kit::{Node, NodeError, Publisher, Qos};
 
 /// One capture of one camera.
 #[derive(Clone)]
-pub(crate) struct Frame {
+pub struct Frame {
     color: Image,
     depth: Image,
     info: CameraInfo,
 }
 
 impl Frame {
-    pub(crate) fn new(
-        camera: &Camera,
-        image: &RgbdImage,
-        stamp: Duration,
-    ) -> Result<Self, ConvertError> {
+    /// Messages of a rendered view.
+    pub fn new(camera: &Camera, image: &RgbdImage, stamp: Duration) -> Result<Self, ConvertError> {
         let header = convert::header(stamp, &optical_frame(&camera.name))?;
         Ok(Self {
             color: convert::color_to_msg(header.clone(), &camera.intrinsics, image.rgb.clone())?,
@@ -34,14 +31,15 @@ impl Frame {
 }
 
 /// Where the frames of one camera go.
-pub(crate) struct CameraTopics {
+pub struct CameraTopics {
     color: Publisher<Image>,
     depth: Publisher<Image>,
     info: Publisher<CameraInfo>,
 }
 
 impl CameraTopics {
-    pub(crate) fn new(node: &Node, name: &str) -> Result<Self, NodeError> {
+    /// Topics `NAME/color/...` and `NAME/depth/...`.
+    pub fn new(node: &Node, name: &str) -> Result<Self, NodeError> {
         Ok(Self {
             color: node.publisher(&format!("{name}/color/image_raw"), Qos::Image)?,
             depth: node.publisher(&format!("{name}/depth/image_rect_raw"), Qos::Image)?,
@@ -49,7 +47,8 @@ impl CameraTopics {
         })
     }
 
-    pub(crate) fn publish(&self, frame: Frame) {
+    /// Publishes one capture.
+    pub fn publish(&self, frame: Frame) {
         self.info.publish(frame.info);
         self.color.publish(frame.color);
         self.depth.publish(frame.depth);
@@ -62,7 +61,7 @@ fn optical_frame(camera: &str) -> String {
 }
 
 /// Where the cameras are.
-pub(crate) fn camera_transforms(
+pub fn camera_transforms(
     cameras: &[Camera],
     world_frame: &str,
     stamp: Duration,

@@ -5,7 +5,7 @@
 //! what is at rest is said again.
 
 mod driver;
-mod frames;
+pub mod frames;
 mod node;
 mod parameters;
 mod workcell;

@@ -463,9 +463,10 @@ async fn a_stop_stops_the_arm_and_it_goes_on_neither_by_itself_nor_on_the_old_ap
         .service_client::<Trigger>("/suction_executor/home")
         .unwrap();
     home_service.wait_for_server(PATIENCE).await.unwrap();
+    // A call may be lost while the two ends are still discovering each other.
     let patient = CallOptions {
-        attempts: 1,
-        timeout: PATIENCE,
+        attempts: 12,
+        timeout: PATIENCE / 12,
     };
     let response = home_service
         .call(&TriggerRequest::default(), &patient)

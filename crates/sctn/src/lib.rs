@@ -8,6 +8,9 @@ mod interval;
 mod recipe;
 mod rollout;
 mod sampling;
+mod sweep;
+mod table;
+mod tensorboard;
 mod training;
 
 pub use agent::Agent;
@@ -18,4 +21,7 @@ pub use interval::wilson_95;
 pub use recipe::{Recipe, RecipeError, Validation};
 pub use rollout::{Rollout, demonstrate, roll_out};
 pub use sampling::{ModuleWeights, Sampling, SamplingError, StepWeights};
+pub use sweep::{Run, RunResult, Score, SnapshotResult, Sweep, Test};
+pub use table::{Cell, Rate, Table};
+pub use tensorboard::EventFile;
 pub use training::{Training, TrainingError};

@@ -101,6 +101,14 @@ impl Recipe {
             path: owned(),
             source,
         })?;
+        recipe.check(path)?;
+        Ok(recipe)
+    }
+
+    /// Checks all ranges; `path` is what errors name.
+    pub(crate) fn check(&self, path: &Path) -> Result<(), RecipeError> {
+        let recipe = self;
+        let owned = || path.to_owned();
         let network = |source| RecipeError::Network {
             path: owned(),
             source,
@@ -133,7 +141,7 @@ impl Recipe {
             snapshots,
             validation,
             ..
-        } = &recipe;
+        } = recipe;
         field(
             "problems",
             !problems.is_empty(),
@@ -161,8 +169,7 @@ impl Recipe {
             good,
             validation.seed.to_string(),
             "an odd number below 10,000",
-        )?;
-        Ok(recipe)
+        )
     }
 
     /// Steps after which a snapshot is taken, the last step among them.

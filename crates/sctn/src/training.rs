@@ -87,6 +87,11 @@ impl Training {
         self.trainer.step()
     }
 
+    /// Learning rate of the next step.
+    pub fn learning_rate(&self) -> f64 {
+        self.trainer.learning_rate()
+    }
+
     /// Whether all gradient steps are done.
     pub fn is_done(&self) -> bool {
         self.step() >= self.recipe.training.steps

@@ -2,6 +2,7 @@
 
 mod bag;
 mod bench;
+mod curves;
 mod demos;
 mod evaluate;
 mod gallery;
@@ -11,6 +12,8 @@ mod picture;
 mod plain_node;
 mod progress;
 mod root;
+mod sweep;
+mod table;
 mod train;
 
 use anyhow::Result;
@@ -38,6 +41,10 @@ enum Command {
     Demos(demos::Demos),
     /// Train a policy on demonstrations, by a recipe
     Train(train::Train),
+    /// Train and test many policies: problems, agents, demonstrations and seeds
+    Sweep(sweep::SweepCommand),
+    /// Print the paper's tables beside the results of sweeps
+    Table(table::TableCommand),
     /// Evaluate a policy on held-out episodes
     Evaluate(evaluate::Evaluate),
     /// Launch the graph on a simulated cell, under an operator
@@ -56,6 +63,8 @@ fn main() -> Result<ExitCode> {
         Command::Bench(bench) => bench.run(&root()?),
         Command::Demos(demos) => demos.run(&root()?),
         Command::Train(train) => train.run(&root()?),
+        Command::Sweep(sweep) => sweep.run(&root()?),
+        Command::Table(table) => table.run(&root()?),
         Command::Evaluate(evaluate) => evaluate.run(&root()?),
         Command::Launch(launch) => launch.run(&root()?),
         Command::Picture(picture) => picture.run(&root()?),

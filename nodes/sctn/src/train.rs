@@ -6,7 +6,7 @@ use crate::root::Root;
 use anyhow::{Context, Result};
 use clap::Args;
 use gctn::{ModelCard, Policy};
-use sctn::{DataSet, Recipe, Training, evaluate};
+use sctn::{DataSet, EventFile, Recipe, Training, evaluate};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::io::Write;
@@ -14,6 +14,9 @@ use std::path::{Path, PathBuf};
 
 /// Gradient steps between lines of progress where there is no terminal.
 const LOG_EVERY: u64 = 50;
+
+/// Gradient steps between scalars for TensorBoard.
+const EVENT_EVERY: u64 = 10;
 
 /// Arguments of `sctn train`.
 #[derive(Args)]
@@ -37,16 +40,16 @@ pub struct Train {
 
 /// One snapshot and how it did on validation episodes.
 #[derive(Clone, Debug, Serialize, Deserialize)]
-struct Snapshot {
-    step: u64,
-    checkpoint: PathBuf,
+pub struct Snapshot {
+    pub step: u64,
+    pub checkpoint: PathBuf,
     /// Mean losses since the snapshot before.
-    pick_loss: f64,
-    place_loss: f64,
+    pub pick_loss: f64,
+    pub place_loss: f64,
     /// Completion rate of each problem on validation episodes.
-    completion: BTreeMap<String, f64>,
+    pub completion: BTreeMap<String, f64>,
     /// Mean reward of each problem.
-    reward: BTreeMap<String, f64>,
+    pub reward: BTreeMap<String, f64>,
 }
 
 impl Snapshot {
@@ -62,55 +65,7 @@ impl Snapshot {
 impl Train {
     pub fn run(self, root: &Root) -> Result<()> {
         let recipe = Recipe::load(&self.recipe)?;
-        let mut data = DataSet::default();
-        for problem in &recipe.problems {
-            data.load(&self.demos, problem, recipe.demonstrations)?;
-        }
-        tracing::info!("{} demonstrations, {} steps", data.len(), data.step_count());
-        gctn::set_threads(recipe.training.threads);
-        let mut training = Training::open(recipe, data, &self.out, self.resume)?;
-        let log = self.out.join("snapshots.jsonl");
-        let mut snapshots = read_log(&log, training.step())?;
-        let bar = progress::bar(training.recipe().training.steps, "steps");
-        bar.set_position(training.step());
-        let (mut pick, mut place, mut count) = (0.0, 0.0, 0u32);
-        while !training.is_done() {
-            let losses = training.advance()?;
-            pick += losses.pick;
-            place += losses.place;
-            count += 1;
-            bar.inc(1);
-            bar.set_message(format!(
-                "pick loss {:.3}, place loss {:.3}",
-                pick / f64::from(count),
-                place / f64::from(count)
-            ));
-            // Where there is no terminal to draw a bar on, a line now and then.
-            if bar.is_hidden() && training.step().is_multiple_of(LOG_EVERY) {
-                tracing::info!(
-                    "step {}: {}, {:?} left",
-                    training.step(),
-                    bar.message(),
-                    bar.eta()
-                );
-            }
-            if training.is_snapshot_due() {
-                let checkpoint = training.save_snapshot(&self.card(&training))?;
-                let mut snapshot = Snapshot {
-                    step: training.step(),
-                    checkpoint,
-                    pick_loss: pick / f64::from(count),
-                    place_loss: place / f64::from(count),
-                    completion: BTreeMap::new(),
-                    reward: BTreeMap::new(),
-                };
-                (pick, place, count) = (0.0, 0.0, 0);
-                bar.suspend(|| validate(root, training.recipe(), &mut snapshot))?;
-                append(&log, &snapshot)?;
-                snapshots.push(snapshot);
-            }
-        }
-        bar.finish_and_clear();
+        let snapshots = train(root, recipe, &self.demos, &self.out, self.resume)?;
         let best = snapshots.iter().max_by(|a, b| {
             a.rank()
                 .partial_cmp(&b.rank())
@@ -129,22 +84,104 @@ impl Train {
         }
         Ok(())
     }
+}
 
-    /// Says how the checkpoint was made.
-    fn card(&self, training: &Training) -> ModelCard {
-        let recipe = training.recipe();
-        ModelCard::from([
-            (
-                "recipe".into(),
-                serde_json::to_string(recipe).unwrap_or_default(),
-            ),
-            ("step".into(), training.step().to_string()),
-            (
-                "trained with".into(),
-                format!("sctn {}", env!("CARGO_PKG_VERSION")),
-            ),
-        ])
+/// Trains by a recipe in a folder, or goes on with what the folder holds; gives all snapshots.
+pub fn train(
+    root: &Root,
+    recipe: Recipe,
+    demos: &Path,
+    out: &Path,
+    resume: bool,
+) -> Result<Vec<Snapshot>> {
+    let mut data = DataSet::default();
+    for problem in &recipe.problems {
+        data.load(demos, problem, recipe.demonstrations)?;
     }
+    tracing::info!("{} demonstrations, {} steps", data.len(), data.step_count());
+    gctn::set_threads(recipe.training.threads);
+    let mut training = Training::open(recipe, data, out, resume)?;
+    let log = out.join("snapshots.jsonl");
+    let mut snapshots = read_log(&log, training.step())?;
+    let board = out.join("tensorboard");
+    let written = || board.display().to_string();
+    let mut events = EventFile::create(&board).with_context(written)?;
+    let bar = progress::bar(training.recipe().training.steps, "steps");
+    bar.set_position(training.step());
+    let (mut pick, mut place, mut count) = (0.0, 0.0, 0u32);
+    while !training.is_done() {
+        let learning_rate = training.learning_rate();
+        let losses = training.advance()?;
+        pick += losses.pick;
+        place += losses.place;
+        count += 1;
+        bar.inc(1);
+        bar.set_message(format!(
+            "pick loss {:.3}, place loss {:.3}",
+            pick / f64::from(count),
+            place / f64::from(count)
+        ));
+        if training.step().is_multiple_of(EVENT_EVERY) {
+            let scalars = [
+                ("loss/pick", losses.pick),
+                ("loss/place", losses.place),
+                ("gradient_norm", losses.gradient_norm),
+                ("learning_rate", learning_rate),
+            ];
+            events
+                .scalars(training.step(), &scalars)
+                .with_context(written)?;
+        }
+        // Where there is no terminal to draw a bar on, a line now and then.
+        if bar.is_hidden() && training.step().is_multiple_of(LOG_EVERY) {
+            tracing::info!(
+                "step {}: {}, {:?} left",
+                training.step(),
+                bar.message(),
+                bar.eta()
+            );
+        }
+        if training.is_snapshot_due() {
+            let checkpoint = training.save_snapshot(&card(&training))?;
+            let mut snapshot = Snapshot {
+                step: training.step(),
+                checkpoint,
+                pick_loss: pick / f64::from(count),
+                place_loss: place / f64::from(count),
+                completion: BTreeMap::new(),
+                reward: BTreeMap::new(),
+            };
+            (pick, place, count) = (0.0, 0.0, 0);
+            bar.suspend(|| validate(root, training.recipe(), &mut snapshot))?;
+            for (problem, completion) in &snapshot.completion {
+                let tag = format!("validation/{problem}");
+                let scalars = [(tag.as_str(), *completion)];
+                events
+                    .scalars(snapshot.step, &scalars)
+                    .with_context(written)?;
+            }
+            append(&log, &snapshot)?;
+            snapshots.push(snapshot);
+        }
+    }
+    bar.finish_and_clear();
+    Ok(snapshots)
+}
+
+/// Says how the checkpoint was made.
+fn card(training: &Training) -> ModelCard {
+    let recipe = training.recipe();
+    ModelCard::from([
+        (
+            "recipe".into(),
+            serde_json::to_string(recipe).unwrap_or_default(),
+        ),
+        ("step".into(), training.step().to_string()),
+        (
+            "trained with".into(),
+            format!("sctn {}", env!("CARGO_PKG_VERSION")),
+        ),
+    ])
 }
 
 /// Lets a snapshot act on the validation episodes of every problem.

@@ -68,6 +68,24 @@ pub enum DemonstrationError {
         /// What is wrong.
         source: ConvertError,
     },
+    /// A recorded run needs one topic of each of its types.
+    #[error("{}: topics of type {type_name}: {found}, expected one with messages", path.display())]
+    Topics {
+        /// The bag.
+        path: PathBuf,
+        /// The type.
+        type_name: &'static str,
+        /// Their names.
+        found: String,
+    },
+    /// A recorded run of which nothing can be learned.
+    #[error("{}: none of the run's {proposals} proposals was placed, confirmed by the operator and observed", path.display())]
+    NoSteps {
+        /// The bag.
+        path: PathBuf,
+        /// Proposals in it.
+        proposals: usize,
+    },
     /// Messages are missing or out of order.
     #[error("{}: step {step}: {actual}, expected {expected}", path.display())]
     Order {
@@ -82,9 +100,9 @@ pub enum DemonstrationError {
     },
 }
 
-const HEIGHTMAP: &str = "/heightmap";
+pub(crate) const HEIGHTMAP: &str = "/heightmap";
 const GOAL: &str = "/goal";
-const PICK_PLACE: &str = "/pick_place";
+pub(crate) const PICK_PLACE: &str = "/pick_place";
 const STEP_RESULT: &str = "/step_result";
 const REWARD: &str = "/reward";
 const FRAME: &str = "world";
@@ -224,8 +242,11 @@ impl Demonstration {
         Ok(bag.finish()?)
     }
 
-    /// Reads a bag that [`Self::write`] wrote, one message at a time.
+    /// Reads a bag that [`Self::write`] wrote, or that of a recorded run: see [`Self::read_run`].
     pub fn read(path: &Path) -> Result<Self, DemonstrationError> {
+        if let Some((demonstration, _)) = Self::read_run(path)? {
+            return Ok(demonstration);
+        }
         let bag = BagReader::open(path)?;
         let note = |key: &'static str| bag.notes().get(key).cloned();
         let bad = |key, expected| DemonstrationError::Note {

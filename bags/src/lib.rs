@@ -10,6 +10,7 @@ mod info;
 mod metadata;
 mod qos;
 mod reader;
+mod run;
 mod scan;
 mod sqlite;
 mod verify;
@@ -21,6 +22,7 @@ pub use error::BagError;
 pub use info::{BagInfo, FileInfo, RunInfo, TopicInfo, outcome_name};
 pub use qos::Qos;
 pub use reader::{BagReader, FileSummary, Messages, RawMessage, Topic};
+pub use run::LeftOut;
 pub use verify::{
     Finding, Findings, Recovery, Verification, VerifiedFile, VerifiedTopic, recover, verify,
 };

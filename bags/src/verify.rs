@@ -458,6 +458,7 @@ fn verify_mcap(
     let mut channels = Channels::default();
     let mut tally = Tally::default();
     let mut footer = None;
+    let mut summary_start = 0;
     while let Some(event) = scan.next().map_err(io)? {
         match event {
             Event::Damage(damage) => {
@@ -537,6 +538,7 @@ fn verify_mcap(
                 }
                 op::DATA_END => {
                     tally.data_ended = true;
+                    summary_start = offset + 9 + body.len() as u64;
                     let expected = scan::data_end(body).unwrap_or(0);
                     let actual = crc.up_to(offset).map_err(io)?;
                     if expected != 0 && expected != actual {
@@ -566,19 +568,17 @@ fn verify_mcap(
         }
     }
     match footer {
-        Some((offset, footer)) => {
-            let start = footer.summary_start;
-            if footer.summary_crc != 0 && start != 0 && start <= offset {
-                let mut crc = RunningCrc::new(&hashed);
-                crc.position = start;
-                // The footer's own fields up to the checksum count too.
-                let actual = crc.up_to(offset + 9 + 16).map_err(io)?;
-                if actual != footer.summary_crc {
-                    let reason = "the checksum of the summary does not fit";
-                    findings.add(&name, Some(start), reason.into());
-                }
+        Some((offset, footer)) if footer.summary_crc != 0 && summary_start != 0 => {
+            let mut crc = RunningCrc::new(&hashed);
+            crc.position = summary_start;
+            // The footer's own fields up to the checksum count too.
+            let actual = crc.up_to(offset + 9 + 16).map_err(io)?;
+            if actual != footer.summary_crc {
+                let reason = "the checksum of the summary does not fit";
+                findings.add(&name, Some(summary_start), reason.into());
             }
         }
+        Some(_) => {}
         None if summary.is_ok() => findings.add(&name, None, "it has no footer".into()),
         None => {}
     }

@@ -48,7 +48,10 @@ impl Stage {
                 .args(["doc", "--workspace", "--no-deps", "--release"])
                 .env("RUSTDOCFLAGS", "-D warnings")),
             Self::Unit => {
-                run(cargo().args(["test", "--workspace", "--release"]))?;
+                // Mangled bags for a minute; less where somebody waits for the tests of that crate alone.
+                run(cargo()
+                    .args(["test", "--workspace", "--release"])
+                    .env("BAGS_FUZZ_SECONDS", "60"))?;
                 // The networks against numpy, which the environment has, and against PyTorch where there is one.
                 let cross_check = |judge: &str| {
                     let test = ["test", "--release", "-p", "gctn", "--lib"];

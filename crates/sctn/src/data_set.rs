@@ -84,6 +84,13 @@ pub fn demonstration_path(directory: &Path, problem: &str, seed: u64) -> PathBuf
     directory.join(problem).join(format!("{seed:06}"))
 }
 
+/// The bag of a recorded run: the folder itself, or its subfolder `run` as `sctn launch --record` leaves it.
+pub fn recorded_run(folder: &Path) -> Option<PathBuf> {
+    let candidates = [folder.to_owned(), folder.join("run")];
+    let mut candidates = candidates.into_iter();
+    candidates.find(|path| path.join("metadata.yaml").is_file())
+}
+
 impl DataSet {
     /// Adds the first `count` demonstrations of a problem, in order of their seeds, from a folder that
     /// `sctn demos` wrote.
@@ -117,19 +124,22 @@ impl DataSet {
                 expected: count,
             });
         }
-        for (_, path) in &bags[..count] {
-            let demonstration = Demonstration::read(path)?;
-            if demonstration.problem != problem {
-                let (actual, expected) = (demonstration.problem, problem.to_owned());
-                return Err(DataSetError::Problem {
-                    path: path.clone(),
-                    actual,
-                    expected,
-                });
-            }
-            self.push(demonstration)?;
+        bags[..count]
+            .iter()
+            .try_for_each(|(_, path)| self.load_bag(path, &[problem.to_owned()]))
+    }
+
+    /// Adds the demonstration of one bag, also that of a recorded run, which must be of one of these problems.
+    pub fn load_bag(&mut self, path: &Path, problems: &[String]) -> Result<(), DataSetError> {
+        let demonstration = Demonstration::read(path)?;
+        if !problems.contains(&demonstration.problem) {
+            return Err(DataSetError::Problem {
+                path: path.to_owned(),
+                actual: demonstration.problem,
+                expected: problems.join(" or "),
+            });
         }
-        Ok(())
+        self.push(demonstration)
     }
 
     /// Adds a demonstration.

@@ -14,7 +14,7 @@ mod tensorboard;
 mod training;
 
 pub use agent::Agent;
-pub use data_set::{DataSet, DataSetError, demonstration_path};
+pub use data_set::{DataSet, DataSetError, demonstration_path, recorded_run};
 pub use evaluation::{EpisodeReport, Evaluation, EvaluationError, attempt, evaluate};
 pub use goal::{NextStepOracle, goal};
 pub use interval::wilson_95;

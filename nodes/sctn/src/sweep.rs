@@ -74,7 +74,13 @@ impl SweepCommand {
         let started = ProcessTime::now();
         let folder = self.out.join("runs").join(run.slug());
         let resume = folder.join("state.safetensors").exists();
-        let snapshots = train(root, recipe.clone(), &self.demos, &folder, resume)?;
+        let snapshots = train(
+            root,
+            recipe.clone(),
+            std::slice::from_ref(&self.demos),
+            &folder,
+            resume,
+        )?;
         let problem = root.problem(&run.problem)?;
         let work_cell = root.work_cell()?;
         let score = |snapshot: &Snapshot, seed: u64, episodes: usize| -> Result<Score> {

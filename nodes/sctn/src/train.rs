@@ -3,10 +3,11 @@
 use crate::evaluate::summary;
 use crate::progress;
 use crate::root::Root;
-use anyhow::{Context, Result};
+use anyhow::{Context, Result, bail};
+use bags::Demonstration;
 use clap::Args;
 use gctn::{ModelCard, Policy};
-use sctn::{DataSet, EventFile, Recipe, Training, evaluate};
+use sctn::{DataSet, EventFile, Recipe, Training, evaluate, recorded_run};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::io::Write;
@@ -24,9 +25,10 @@ pub struct Train {
     /// Recipe
     #[arg(long)]
     recipe: PathBuf,
-    /// Folder that `sctn demos` wrote
-    #[arg(long)]
-    demos: PathBuf,
+    /// Folder that `sctn demos` wrote; or recorded runs, each the folder of `sctn launch --record` or a bag: their
+    /// steps that the operator approved and confirmed, as many runs as are given in place of the recipe's number
+    #[arg(long, required = true, num_args = 1..)]
+    demos: Vec<PathBuf>,
     /// Folder for state, snapshots and the policy
     #[arg(long)]
     out: PathBuf,
@@ -86,18 +88,54 @@ impl Train {
     }
 }
 
+/// The demonstrations of one folder that `sctn demos` wrote, or of recorded runs.
+fn load(demos: &[PathBuf], recipe: &mut Recipe) -> Result<DataSet> {
+    let mut data = DataSet::default();
+    let runs: Vec<PathBuf> = demos.iter().filter_map(|path| recorded_run(path)).collect();
+    if runs.is_empty() {
+        let [folder] = demos else {
+            bail!("--demos: expected one folder of demonstrations, or recorded runs only");
+        };
+        for problem in &recipe.problems {
+            data.load(folder, problem, recipe.demonstrations)?;
+        }
+        return Ok(data);
+    }
+    if runs.len() < demos.len() {
+        bail!("--demos: recorded runs and other folders cannot be mixed");
+    }
+    recipe.demonstrations = runs.len();
+    for run in runs {
+        data.load_bag(&run, &recipe.problems)?;
+        if let Some((demonstration, left_out)) = Demonstration::read_run(&run)? {
+            tracing::info!(
+                "{}: {} steps, {} proposals left out",
+                run.display(),
+                demonstration.steps.len(),
+                left_out.len()
+            );
+            for left_out in left_out {
+                tracing::info!(
+                    "  step {}, attempt {}: {}",
+                    left_out.step,
+                    left_out.attempt,
+                    left_out.reason
+                );
+            }
+        }
+    }
+    Ok(data)
+}
+
 /// Trains by a recipe in a folder, or goes on with what the folder holds; gives all snapshots.
 pub fn train(
     root: &Root,
-    recipe: Recipe,
-    demos: &Path,
+    mut recipe: Recipe,
+    demos: &[PathBuf],
     out: &Path,
     resume: bool,
 ) -> Result<Vec<Snapshot>> {
-    let mut data = DataSet::default();
-    for problem in &recipe.problems {
-        data.load(demos, problem, recipe.demonstrations)?;
-    }
+    let data = load(demos, &mut recipe)?;
     tracing::info!("{} demonstrations, {} steps", data.len(), data.step_count());
     gctn::set_threads(recipe.training.threads);
     let mut training = Training::open(recipe, data, out, resume)?;

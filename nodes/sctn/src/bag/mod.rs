@@ -1,5 +1,7 @@
 //! `sctn bag`: records, plays, looks into, checks and repairs bags.
 
+mod bench;
+mod export;
 mod play;
 mod record;
 pub mod recorder;
@@ -37,6 +39,10 @@ enum Command {
     Verify(Verify),
     /// Write a repaired copy, also of a bag that was never finished; exit code 3 if something was left out
     Recover(Recover),
+    /// Write demonstrations and recorded runs as a data set for LeRobot, and as pictures and arrays
+    Export(export::Export),
+    /// Measure the writer beside the disk, and a recording of three cameras
+    Bench(bench::Bench),
 }
 
 #[derive(Args)]
@@ -98,6 +104,8 @@ impl Bag {
             Command::Info(info) => info.run(),
             Command::Verify(verify) => verify.run(),
             Command::Recover(recover) => recover.run(),
+            Command::Export(export) => export.run(),
+            Command::Bench(bench) => bench.run(),
         }
     }
 }

@@ -159,6 +159,9 @@ impl Launch {
             error = graph.failure() => Err(error),
             result = wait_for_end() => result.and(Err(anyhow::anyhow!("stopped by a signal"))),
         };
+        if let Some(recorder) = &recorder {
+            recorder.last_words().await;
+        }
         graph.stop(&context).await;
         let bag = match recorder {
             Some(recorder) => Some(recorder.finish().await?.bag),

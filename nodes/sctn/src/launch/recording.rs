@@ -15,8 +15,8 @@ use std::path::Path;
 use std::time::Duration;
 
 const CAMERAS: [&str; 3] = ["front", "left", "right"];
-/// What was sent last may still be on its way.
-const LAST_WORDS: Duration = Duration::from_millis(300);
+/// What was sent last may still be on its way, or have to be sent again: who sent it must live so long.
+const LAST_WORDS: Duration = Duration::from_millis(500);
 
 const TOPICS: [(&str, &str, Qos); 9] = [
     ("heightmap", Heightmap::TYPE_NAME, Qos::LATCHED),
@@ -62,9 +62,13 @@ impl RunRecorder {
         Ok(Self { context, recorder })
     }
 
+    /// Waits for what is still on its way; to be called before the nodes end.
+    pub async fn last_words(&self) {
+        tokio::time::sleep(LAST_WORDS).await;
+    }
+
     /// Completes the bag.
     pub async fn finish(self) -> Result<Recording> {
-        tokio::time::sleep(LAST_WORDS).await;
         let recording = self.recorder.finish().await;
         self.context.shutdown();
         recording

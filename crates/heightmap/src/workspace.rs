@@ -166,6 +166,37 @@ impl Heightmap {
         let changed = pairs.filter(|pair| !same(pair)).count();
         changed as f64 / self.workspace.len() as f64
     }
+
+    /// How different two scenes look: the mean over cells of the colour difference (of the full range) and the
+    /// height difference (of 4 cm, and no more than that). Infinite if the heightmaps cover different
+    /// workspaces.
+    pub fn distance(&self, other: &Self) -> f64 {
+        const HEIGHT_M: f32 = 0.04;
+        let sizes = |heightmap: &Self| (heightmap.height_m.len(), heightmap.rgb.len());
+        if self.workspace != other.workspace || sizes(self) != sizes(other) {
+            return f64::INFINITY;
+        }
+        let colour: u64 = self
+            .rgb
+            .iter()
+            .zip(&other.rgb)
+            .map(|(a, b)| u64::from(a.abs_diff(*b)))
+            .sum();
+        // A height that is no number is as far away as can be: `min` takes the other one.
+        let height = |(a, b): (&f32, &f32)| f64::from(((a - b).abs() / HEIGHT_M).min(1.0));
+        let height: f64 = self.height_m.iter().zip(&other.height_m).map(height).sum();
+        (colour as f64 / (3.0 * 255.0) + height) / self.workspace.len() as f64
+    }
+
+    /// Index of the image that looks most like this one, the first of equals; none of no images.
+    pub fn nearest<'a>(&self, images: impl IntoIterator<Item = &'a Self>) -> Option<usize> {
+        images
+            .into_iter()
+            .map(|image| self.distance(image))
+            .enumerate()
+            .min_by(|(_, a), (_, b)| a.total_cmp(b))
+            .map(|(index, _)| index)
+    }
 }
 
 #[cfg(test)]
@@ -250,6 +281,30 @@ mod tests {
             before.changed_fraction(&Heightmap::new(elsewhere), 0.005),
             1.0
         );
+    }
+
+    #[test]
+    fn the_distance_counts_colours_and_heights_and_the_nearest_is_the_first_of_equals() {
+        let before = Heightmap::new(Workspace::RAVENS);
+        let mut raised = before.clone();
+        raised.height_m[..512].fill(0.02);
+        let mut high = before.clone();
+        high.height_m[..512].fill(9.0);
+        let mut painted = before.clone();
+        painted.rgb[..3 * 512].fill(255);
+        assert_eq!(before.distance(&before), 0.0);
+        assert!((before.distance(&raised) - 0.005).abs() < 1e-9);
+        assert!((before.distance(&high) - 0.01).abs() < 1e-9);
+        assert!((before.distance(&painted) - 0.01).abs() < 1e-9);
+        high.height_m[0] = f32::NAN;
+        assert!((before.distance(&high) - 0.01).abs() < 1e-9);
+        let elsewhere = Heightmap::new(Workspace {
+            z_max_m: 0.5,
+            ..Workspace::RAVENS
+        });
+        assert_eq!(before.distance(&elsewhere), f64::INFINITY);
+        assert_eq!(raised.nearest([&painted, &before, &before]), Some(1));
+        assert_eq!(raised.nearest([]), None);
     }
 
     proptest! {

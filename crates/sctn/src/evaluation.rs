@@ -23,6 +23,8 @@ pub struct EpisodeReport {
     pub reward: f64,
     /// Steps taken.
     pub steps: usize,
+    /// Steps before which the goal module *image distance* would have named the same goal as the oracle.
+    pub image_distance_right: usize,
 }
 
 /// An evaluation of one policy on one problem.
@@ -38,6 +40,9 @@ pub struct Evaluation {
     pub completion: f64,
     /// Mean reward.
     pub reward: f64,
+    /// Share of all steps before which the goal module *image distance* would have named the same goal as
+    /// the oracle.
+    pub image_distance: f64,
     /// 95 % interval of the completion rate (Wilson).
     pub interval_95: [f64; 2],
     /// Seeds passed over because the demonstrator failed on them: there was no demonstration sequence.
@@ -97,13 +102,22 @@ impl From<gctn::Error> for StepError {
     }
 }
 
+/// What a policy did in one episode.
+#[derive(Clone, Debug)]
+pub struct Attempt {
+    /// What was seen and done.
+    pub rollout: Rollout,
+    /// Steps before which the goal module *image distance* would have named the same goal as the oracle.
+    pub image_distance_right: usize,
+}
+
 /// Lets the policy act on one episode, with the demonstration sequence of the same start. `None`: the
 /// demonstrator failed on this seed.
 pub fn attempt(
     environment: &mut Environment,
     policy: &Policy,
     seed: u64,
-) -> Result<Option<Rollout>, EvaluationError> {
+) -> Result<Option<Attempt>, EvaluationError> {
     let failed = |error| EvaluationError::Environment {
         seed,
         source: Box::new(error),
@@ -115,10 +129,14 @@ pub fn attempt(
     let goals = shown.demonstration.goals();
     let conditioning = policy.config().conditioning;
     let oracle = std::cell::Cell::new(NextStepOracle::new(goals.len()));
+    let first = shown.demonstration.observation(0);
+    let mut image_distance_right = 0;
     let rollout = roll_out(
         environment,
         seed,
         |_, observation| {
+            let nearest = observation.nearest(std::iter::once(first).chain(goals.iter().copied()));
+            image_distance_right += usize::from(nearest == Some(oracle.get().reached()));
             let Some(goal) = goal(&goals, oracle.get().index(), conditioning) else {
                 return Ok(None);
             };
@@ -134,7 +152,11 @@ pub fn attempt(
             oracle.set(told);
         },
     );
-    rollout.map(Some).map_err(|error| match error {
+    let attempt = |rollout| Attempt {
+        rollout,
+        image_distance_right,
+    };
+    rollout.map(attempt).map(Some).map_err(|error| match error {
         StepError::Environment(source) => EvaluationError::Environment {
             seed,
             source: Box::new(source),
@@ -180,11 +202,12 @@ pub fn evaluate(
                 });
             }
             let seed = first_seed + 2 * index;
-            let report = attempt(&mut environment, policy, seed)?.map(|rollout| EpisodeReport {
+            let report = attempt(&mut environment, policy, seed)?.map(|attempt| EpisodeReport {
                 seed,
-                completed: rollout.complete,
-                reward: rollout.total_reward,
-                steps: rollout.demonstration.steps.len(),
+                completed: attempt.rollout.complete,
+                reward: attempt.rollout.total_reward,
+                steps: attempt.rollout.demonstration.steps.len(),
+                image_distance_right: attempt.image_distance_right,
             });
             if let Some(report) = &report {
                 progress(report);
@@ -222,6 +245,11 @@ pub fn evaluate(
     }
     let completed = reports.iter().filter(|report| report.completed).count();
     let count = reports.len().max(1) as f64;
+    let steps: usize = reports.iter().map(|report| report.steps).sum();
+    let named: usize = reports
+        .iter()
+        .map(|report| report.image_distance_right)
+        .sum();
     let conditioning = policies.first().map(|policy| policy.config().conditioning);
     Ok(Evaluation {
         problem: problem.name().to_owned(),
@@ -233,6 +261,7 @@ pub fn evaluate(
         episodes: reports.len(),
         completion: completed as f64 / count,
         reward: reports.iter().map(|report| report.reward).sum::<f64>() / count,
+        image_distance: named as f64 / steps.max(1) as f64,
         interval_95: wilson_95(completed, reports.len()),
         skipped_seeds,
         seconds: started.elapsed().as_secs_f64(),

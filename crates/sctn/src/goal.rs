@@ -1,4 +1,6 @@
 //! Next-step goal modules (paper, section IV-A): which image of the demonstration sequence comes next.
+//!
+//! The module *image distance* is [`Heightmap::nearest`] among the first observation and the sequence.
 
 use gctn::{Goal, GoalConditioning};
 use heightmap::Heightmap;
@@ -19,6 +21,11 @@ impl NextStepOracle {
     /// Index of the next-step goal in the sequence. After the last step it stays at the last image.
     pub fn index(&self) -> usize {
         self.next.min(self.len.saturating_sub(1))
+    }
+
+    /// Number of images of the sequence that have been reached.
+    pub fn reached(&self) -> usize {
+        self.next
     }
 
     /// Tells of a step's delta reward: a gain advances by one image, a loss steps back by one.

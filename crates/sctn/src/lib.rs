@@ -15,7 +15,7 @@ mod training;
 
 pub use agent::Agent;
 pub use data_set::{DataSet, DataSetError, demonstration_path, recorded_run};
-pub use evaluation::{EpisodeReport, Evaluation, EvaluationError, attempt, evaluate};
+pub use evaluation::{Attempt, EpisodeReport, Evaluation, EvaluationError, attempt, evaluate};
 pub use goal::{NextStepOracle, goal};
 pub use interval::wilson_95;
 pub use recipe::{Recipe, RecipeError, Validation};

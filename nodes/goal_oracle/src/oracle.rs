@@ -73,7 +73,9 @@ pub enum Refusal {
     #[error("decision is {0}, expected APPROVE=1, REJECT=2, ADVANCE=3, RETRY=4 or STOP=5")]
     NoDecision(u8),
     /// The parameter `require_confirmation` is false.
-    #[error("this oracle decides by itself (require_confirmation is false)")]
+    #[error(
+        "this oracle decides by itself (require_confirmation is false, or goal_module is image_distance)"
+    )]
     NotAsked,
 }
 
@@ -120,7 +122,18 @@ pub struct Oracle {
     current: Option<Current>,
     /// Proposals of earlier goals, and superseded ones of this.
     seen: BTreeSet<u64>,
-    require_confirmation: bool,
+    decider: Decider,
+}
+
+/// Who says, after a motion, which goal is next.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Decider {
+    /// The operator, by ADVANCE and RETRY.
+    Operator,
+    /// The motion's outcome: PLACED advances.
+    Outcome,
+    /// The first heightmap after the motion: see [`Oracle::matched`].
+    Image,
 }
 
 /// The goals of a demonstration: what was seen after each step with a reward.
@@ -174,7 +187,7 @@ pub fn sequence(
 
 impl Oracle {
     /// Starts at the first of `goals`, of which there is at least one.
-    pub fn new(goals: Vec<Goal>, require_confirmation: bool) -> Self {
+    pub fn new(goals: Vec<Goal>, decider: Decider) -> Self {
         Self {
             goals,
             index: 0,
@@ -183,7 +196,7 @@ impl Oracle {
             stopped: false,
             current: None,
             seen: BTreeSet::new(),
-            require_confirmation,
+            decider,
         }
     }
 
@@ -281,15 +294,37 @@ impl Oracle {
             return Change::None;
         }
         current.moved = Some(result.header.stamp);
-        let verdict = match (self.require_confirmation, result.outcome) {
-            (true, _) => current.waiting,
-            (false, StepResult::PLACED) => Some(Verdict::Advance),
-            (false, _) => Some(Verdict::Retry),
+        let verdict = match (self.decider, result.outcome) {
+            (Decider::Operator, _) => current.waiting,
+            (Decider::Outcome, StepResult::PLACED) => Some(Verdict::Advance),
+            (Decider::Outcome, _) => Some(Verdict::Retry),
+            (Decider::Image, _) => None,
         };
         match verdict {
             Some(verdict) => self.decide(verdict, result.header.stamp),
             None => Change::None,
         }
+    }
+
+    /// Stamp of a motion whose result waits for a heightmap to decide by.
+    pub fn waits_for_image(&self) -> Option<Time> {
+        let waits = self.decider == Decider::Image && !self.stopped;
+        self.current.filter(|_| waits)?.moved
+    }
+
+    /// A heightmap seen after the motion looks most like the state in which so many goals are reached: the
+    /// goal after them is next, be that further on, the same once more, or an earlier one.
+    pub fn matched(&mut self, reached: usize) -> Change {
+        let Some(stamp) = self.waits_for_image() else {
+            return Change::None;
+        };
+        let reached = reached.min(self.goals.len());
+        let attempt = if reached == self.index {
+            self.attempt + 1
+        } else {
+            0
+        };
+        self.latch(reached, attempt, stamp)
     }
 
     /// The operator has spoken. Approvals and rejections are the executor's business.
@@ -311,7 +346,7 @@ impl Oracle {
         if self.is_complete() {
             return Err(Refusal::Complete);
         }
-        if !self.require_confirmation {
+        if self.decider != Decider::Operator {
             return Err(Refusal::NotAsked);
         }
         let id = confirmation.proposal_id;
@@ -368,13 +403,21 @@ mod tests {
     }
 
     fn with_confirmation(count: u32, require_confirmation: bool) -> Oracle {
+        let decider = match require_confirmation {
+            true => Decider::Operator,
+            false => Decider::Outcome,
+        };
+        decided_by(count, decider)
+    }
+
+    fn decided_by(count: u32, decider: Decider) -> Oracle {
         let goal = |step| Goal {
             problem: "placing".into(),
             step,
             step_count: count,
             ..Goal::default()
         };
-        Oracle::new((1..=count).map(goal).collect(), require_confirmation)
+        Oracle::new((1..=count).map(goal).collect(), decider)
     }
 
     fn proposal(id: u64, step: u32, attempt: u32) -> PickPlace {
@@ -614,6 +657,45 @@ mod tests {
             oracle.confirmed(&says(StepConfirmation::ADVANCE, 8)),
             Err(Refusal::NotAsked)
         );
+    }
+
+    #[test]
+    fn an_image_after_the_motion_says_which_goal_is_next() {
+        let mut oracle = decided_by(3, Decider::Image);
+        oracle.proposed(&proposal(7, 1, 0));
+        // Nothing has moved yet: what is seen decides nothing.
+        assert_eq!(oracle.matched(2), Change::None);
+        let result_of = |id, sec| result(id, StepResult::PLACED, sec);
+        assert_eq!(oracle.result(&result_of(7, 5)), Change::None);
+        assert_eq!(oracle.waits_for_image().unwrap().sec, 5);
+        // The operator is not asked.
+        assert_eq!(
+            oracle.confirmed(&says(StepConfirmation::ADVANCE, 7)),
+            Err(Refusal::NotAsked)
+        );
+        assert_eq!(goal(oracle.matched(1)), (2, 0, 5, false));
+        // Not reached: once more. The same image counts once.
+        oracle.proposed(&proposal(8, 2, 0));
+        oracle.result(&result_of(8, 6));
+        assert_eq!(goal(oracle.matched(1)), (2, 1, 6, false));
+        assert_eq!(oracle.matched(1), Change::None);
+        // Something was undone: back.
+        oracle.proposed(&proposal(9, 2, 1));
+        oracle.result(&result_of(9, 7));
+        assert_eq!(goal(oracle.matched(0)), (1, 0, 7, false));
+        oracle.proposed(&proposal(10, 1, 0));
+        oracle.result(&result_of(10, 8));
+        assert_eq!(goal(oracle.matched(9)), (3, 0, 8, true));
+        assert!(oracle.is_complete());
+    }
+
+    #[test]
+    fn after_a_stop_no_image_moves_the_goal() {
+        let mut oracle = decided_by(2, Decider::Image);
+        oracle.proposed(&proposal(7, 1, 0));
+        oracle.result(&result(7, StepResult::PLACED, 5));
+        oracle.confirmed(&says(StepConfirmation::STOP, 0)).unwrap();
+        assert_eq!(oracle.matched(1), Change::None);
     }
 
     proptest! {

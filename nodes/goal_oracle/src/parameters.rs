@@ -5,12 +5,24 @@ use std::path::{Path, PathBuf};
 use node_kit::{InvalidParameter, Parameters};
 use serde::{Deserialize, Serialize};
 
+/// What says which goal is next.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum GoalModule {
+    /// The operator, or the outcome of the motion.
+    #[default]
+    Oracle,
+    /// The image of the sequence that looks most like what is seen after the motion.
+    ImageDistance,
+}
+
 /// Explained in config/goal_oracle.yaml.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 #[allow(missing_docs)]
 pub struct GoalOracleParameters {
     pub demonstration: PathBuf,
+    pub goal_module: GoalModule,
     pub require_confirmation: bool,
     pub world_frame: String,
 }
@@ -19,6 +31,7 @@ impl Default for GoalOracleParameters {
     fn default() -> Self {
         Self {
             demonstration: PathBuf::new(),
+            goal_module: GoalModule::Oracle,
             require_confirmation: true,
             world_frame: "world".into(),
         }

@@ -199,6 +199,85 @@ async fn results_and_confirmations_walk_through_a_demonstration() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
+async fn by_image_distance_what_is_seen_after_a_motion_says_which_goal_is_next() {
+    let directory = tempfile::tempdir().unwrap();
+    let bag = directory.path().join("demonstration");
+    demonstration().write(&bag).unwrap();
+    let context = Context::new(Network {
+        // Of its own: the other tests run beside it.
+        domain_id: 58,
+        localhost_only: true,
+    });
+    let (node, _) = context
+        .node::<NoParameters>("others", &RosArguments::default())
+        .unwrap();
+    let results = node
+        .publisher::<StepResult>("step_result", Qos::Event)
+        .unwrap();
+    let heightmaps = node
+        .publisher::<msgs::sctn_msgs::Heightmap>("heightmap", Qos::Latched)
+        .unwrap();
+    let mut goals = node.subscription::<Goal>("goal", Qos::Latched).unwrap();
+    let parameter = |name: &str, value: String| ParameterSource::Argument {
+        node: None,
+        name: name.into(),
+        value,
+    };
+    let arguments = RosArguments {
+        parameters: vec![
+            parameter("demonstration", bag.display().to_string()),
+            parameter("goal_module", "image_distance".into()),
+        ],
+        ..RosArguments::default()
+    };
+    let oracle = context
+        .start(
+            "goal_oracle",
+            &arguments,
+            |node, parameters: GoalOracleParameters| goal_oracle::run(node, parameters),
+        )
+        .unwrap();
+    let see = |height_m: f32, sec: i32| {
+        let mut header = msgs::std_msgs::Header::default();
+        header.stamp.sec = sec;
+        let message = msgs::convert::heightmap_to_msg(heightmap(height_m), header, 3, 1.0);
+        heightmaps.publish(message.unwrap());
+    };
+    next_goal(&mut goals, 1, 0, false).await;
+    assert!(
+        node.graph()
+            .wait_for_subscription("/heightmap", LIMIT)
+            .await
+    );
+    assert!(
+        node.graph()
+            .wait_for_subscription("/step_result", LIMIT)
+            .await
+    );
+
+    // Seen before the motion's end, it does not count, though it shows the last goal.
+    see(0.03, 4);
+    results.publish(result(11, StepResult::PLACED, 5));
+    // Most like the first observation: nothing is reached.
+    see(0.002, 6);
+    let again = next_goal(&mut goals, 1, 1, false).await;
+    assert_eq!(again.header.stamp.sec, 5);
+    // Here the heightmap comes before the result. It is most like the first goal, of height 0.01.
+    see(0.012, 8);
+    results.publish(result(12, StepResult::GRASP_FAILED, 7));
+    let second = next_goal(&mut goals, 2, 0, false).await;
+    assert_eq!(
+        (second.header.stamp.sec, second.heightmap.height_m[0]),
+        (7, 0.03)
+    );
+    results.publish(result(13, StepResult::PLACED, 9));
+    see(0.029, 10);
+    next_goal(&mut goals, 2, 0, true).await;
+    context.shutdown();
+    oracle.await.unwrap().unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread")]
 async fn without_a_demonstration_the_node_refuses_to_start() {
     let context = Context::new(Network {
         domain_id: 52,

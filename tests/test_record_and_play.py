@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import pathlib
 import random
 import signal
@@ -22,7 +23,7 @@ from cell_operator import EVENT, LATCHED, Operator
 STORE = get_typestore(Stores.ROS2_JAZZY)
 # Many messages in a short time: none may fall out of a reader's history.
 DEEP = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.VOLATILE)
-KILLS = 10
+KILLS = int(os.environ.get("SCTN_KILLS", "10"))
 # What was published so long before the kill has to be in the bag: transport and one flush.
 SETTLED_S = 0.3
 

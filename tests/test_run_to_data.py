@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import operator
 import pathlib
 import re
 import struct
@@ -12,6 +13,8 @@ import sys
 import numpy as np
 import pyarrow.parquet
 import pytest
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 
 from processes import REPOSITORY
@@ -82,6 +85,31 @@ def test_an_exported_run_is_what_the_bag_says(start, run: pathlib.Path, tmp_path
     stats = json.loads((out / "meta/episodes_stats.jsonl").read_text().splitlines()[0])["stats"]
     assert np.allclose(stats["action"]["mean"], np.mean([row["action"] for row in table], axis=0))
     assert set(stats) == set(info["features"])
+
+
+def test_two_readers_of_others_read_every_message_of_a_recorded_run(run: pathlib.Path) -> None:
+    (file,) = (run / "run").glob("*.mcap")
+    with file.open("rb") as stream:
+        reader = make_reader(stream, decoder_factories=[DecoderFactory()])
+        by_mcap = [(c.topic, m.log_time, m.data, decoded) for _, c, m, decoded in reader.iter_decoded_messages()]
+    with AnyReader([run / "run"]) as reader:
+        by_rosbags = [(c.topic, time, bytes(raw), reader.deserialize(raw, c.msgtype)) for c, time, raw in reader.messages()]
+    assert len(by_mcap) == len(by_rosbags) > 1000
+    key = operator.itemgetter(0, 1, 2)
+    for ours, theirs in zip(sorted(by_mcap, key=key), sorted(by_rosbags, key=key), strict=True):
+        assert ours[:3] == theirs[:3]
+        assert same(ours[3], theirs[3]), ours[0]
+
+
+def same(ours: object, theirs: object) -> bool:
+    """Whether a message decoded by mcap-ros2-support says what the same message does by rosbags."""
+    if fields := getattr(ours, "__slots__", None):
+        return all(same(getattr(ours, name), getattr(theirs, name)) for name in fields if not name.startswith("_"))
+    if isinstance(ours, (list, tuple)):
+        return len(ours) == len(theirs) and all(map(same, ours, theirs))
+    if isinstance(ours, (bytes, bytearray, memoryview)):
+        return bytes(ours) == bytes(theirs)
+    return ours == theirs
 
 
 def test_the_page_of_the_sample_bag_reads_it() -> None:

@@ -387,6 +387,12 @@ impl BagWriter {
             .map_err(|error| BagError::io(&self.open.path, error))
     }
 
+    /// The file that is being written, for another thread to put on the disk ([`File::sync_data`]) while this one goes on.
+    pub fn open_file(&self) -> Result<File, BagError> {
+        let clone = self.open.file.try_clone();
+        clone.map_err(|error| BagError::io(&self.open.path, error))
+    }
+
     /// Bytes in the files so far, without the open chunk.
     pub fn bytes(&self) -> Result<u64, BagError> {
         Ok(self.complete_bytes + self.open.bytes()?)

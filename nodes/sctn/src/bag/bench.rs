@@ -17,6 +17,8 @@ use std::time::{Duration, Instant};
 
 /// Messages of the writer's benchmark.
 const MESSAGE_BYTES: usize = 1_000_000;
+/// Longer than any window of the compression: no message repeats one that it remembers.
+const NOISE_BYTES: usize = 16 * MESSAGE_BYTES;
 const WRITTEN_BYTES: usize = 2_000_000_000;
 const CAMERAS: [&str; 3] = ["front", "left", "right"];
 const RATE_HZ: f64 = 30.0;
@@ -53,7 +55,7 @@ impl Bench {
             return publish(Duration::from_secs(seconds));
         }
         let folder = tempfile::tempdir_in(&self.dir).context("--dir")?;
-        let data = noise(MESSAGE_BYTES);
+        let data = noise(NOISE_BYTES);
         let disk = disk(folder.path(), &data)?;
         println!("the disk alone: {disk:.0} MB/s (sequential, 1 MB at a time, synced)");
         let mut writer = json!({"disk_mb_s": disk});
@@ -115,12 +117,17 @@ fn noise(count: usize) -> Vec<u8> {
     (0..count).map(byte).collect()
 }
 
+fn messages(noise: &[u8]) -> impl Iterator<Item = &[u8]> {
+    let all = noise.chunks_exact(MESSAGE_BYTES).cycle();
+    all.take(WRITTEN_BYTES / MESSAGE_BYTES)
+}
+
 fn disk(folder: &Path, data: &[u8]) -> Result<f64> {
     let path = folder.join("disk");
     let started = Instant::now();
     let mut file = File::create_new(&path)?;
-    for _ in 0..WRITTEN_BYTES / data.len() {
-        file.write_all(data)?;
+    for message in messages(data) {
+        file.write_all(message)?;
     }
     file.sync_all()?;
     let rate = WRITTEN_BYTES as f64 / 1e6 / started.elapsed().as_secs_f64();
@@ -133,9 +140,9 @@ fn bag(folder: &Path, data: &[u8], compression: Compression) -> Result<f64> {
     let started = Instant::now();
     let mut bag = BagWriter::create(&path, compression)?;
     let topic = bag.add::<Image>("/image", Qos::BEST_EFFORT)?;
-    for index in 0..WRITTEN_BYTES / data.len() {
+    for (index, message) in messages(data).enumerate() {
         let time = Duration::from_millis(index as u64);
-        bag.write_cdr(topic, time, time, data)?;
+        bag.write_cdr(topic, time, time, message)?;
     }
     bag.finish()?;
     let rate = WRITTEN_BYTES as f64 / 1e6 / started.elapsed().as_secs_f64();

@@ -50,7 +50,7 @@ pub struct Record {
     #[arg(long, value_name = "SECONDS")]
     duration: Option<f64>,
     /// Megabytes that may wait for the disk; what comes beyond is lost and counted
-    #[arg(long, value_name = "MB", default_value_t = 128)]
+    #[arg(long, value_name = "MB", default_value_t = 192)]
     queue: usize,
     /// End when less room than this is left on the disk
     #[arg(long, value_name = "MB", default_value_t = 64)]

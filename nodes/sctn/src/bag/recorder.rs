@@ -8,6 +8,7 @@ use node_kit::{Node, Offer, RawQos};
 use regex::RegexSet;
 use serde::Serialize;
 use std::collections::{BTreeMap, BTreeSet};
+use std::fs::File;
 use std::path::{Path, PathBuf};
 use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering::Relaxed};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError, mpsc};
@@ -48,7 +49,7 @@ impl Default for RecorderOptions {
     fn default() -> Self {
         Self {
             write: WriteOptions::default(),
-            queue_bytes: 128 << 20,
+            queue_bytes: 192 << 20,
             min_free_bytes: 64 << 20,
             use_sim_time: false,
         }
@@ -202,6 +203,7 @@ impl Recorder {
         let shared = Arc::new(Shared::default());
         let (queue, entries) = mpsc::channel();
         let writing = Writing {
+            disk: put_on_disk(&bag)?,
             bag,
             handles: Vec::new(),
             shared: Arc::clone(&shared),
@@ -449,9 +451,27 @@ fn qos(offer: RawQos) -> Qos {
     }
 }
 
+/// A thread that has files put on the disk while others write: what has come survives a power cut a few seconds later,
+/// and the system's own buffers never grow so far that it stops the writer.
+fn put_on_disk(bag: &BagWriter) -> Result<mpsc::SyncSender<File>> {
+    let (disk, files) = mpsc::sync_channel::<File>(1);
+    let partial = bag.partial().to_owned();
+    std::thread::Builder::new()
+        .name("disk".into())
+        .spawn(move || {
+            for file in files {
+                if let Err(error) = file.sync_data() {
+                    tracing::error!("{}: {error}", partial.display());
+                }
+            }
+        })?;
+    Ok(disk)
+}
+
 /// The thread that owns the bag.
 struct Writing {
     bag: BagWriter,
+    disk: mpsc::SyncSender<File>,
     handles: Vec<Option<TopicHandle>>,
     shared: Arc<Shared>,
     min_free_bytes: u64,
@@ -465,6 +485,8 @@ impl Writing {
             if unflushed && flushed.elapsed() >= FLUSH_EVERY {
                 self.bag.flush()?;
                 (flushed, unflushed) = (Instant::now(), false);
+                // Still busy with the last time: then the next time.
+                let _ = self.disk.try_send(self.bag.open_file()?);
                 if self.is_disk_full()? {
                     return self.end(End::DiskFull);
                 }

@@ -18,6 +18,7 @@ SCAN = "sensor_msgs/msg/LaserScan"
 KINDS = {
     "mcap": (StoragePlugin.MCAP, None),
     "mcap zstd": (StoragePlugin.MCAP, CompressionMode.STORAGE),
+    "mcap file": (StoragePlugin.MCAP, CompressionMode.FILE),
     "mcap messages": (StoragePlugin.MCAP, CompressionMode.MESSAGE),
     "sqlite": (StoragePlugin.SQLITE3, None),
     "sqlite messages": (StoragePlugin.SQLITE3, CompressionMode.MESSAGE),

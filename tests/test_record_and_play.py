@@ -6,19 +6,23 @@ import json
 import os
 import pathlib
 import random
+import resource
 import signal
+import subprocess
 import time
 
 import pytest
 import yaml
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rosbags.highlevel import AnyReader
+from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 from sctn_msgs.msg import StepResult
 from sensor_msgs.msg import BatteryState
 from std_msgs.msg import String
 
 from cell_operator import EVENT, LATCHED, Operator
+from processes import BINARIES, environment
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
 # Many messages in a short time: none may fall out of a reader's history.
@@ -147,6 +151,117 @@ def test_a_full_disk_ends_the_recording_and_what_was_written_is_a_bag(
     assert json.loads(recorder.output().splitlines()[-1])["end"] == "disk_full"
     assert "room" in recorder.errors()
     assert [text.data for _, text in contents(bag)] == ["the last word"]
+
+
+def test_a_disk_without_room_ends_the_recording_and_what_fitted_is_recovered(
+    start, operator: Operator, domain: int, tmp_path: pathlib.Path
+) -> None:
+    def no_more_than_three_megabytes() -> None:
+        # Beyond the limit a write fails, as on a full disk.
+        signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (3_000_000, 3_000_000))
+
+    command = [BINARIES / "sctn", "bag", "record", "/big", "--out", tmp_path / "bag", "--compression", "none"]
+    log = tmp_path / "record.log"
+    with log.open("wb") as errors:
+        recorder = subprocess.Popen(
+            command, env=environment(domain), stdin=subprocess.DEVNULL, stderr=errors, preexec_fn=no_more_than_three_megabytes
+        )
+    try:
+        big = operator.node.create_publisher(String, "/big", DEEP)
+        wait_for_recorder(operator, big)
+        for index in range(80):
+            big.publish(String(data=f"{index} " + "x" * 100_000))
+            operator.spin(0.05)
+            if recorder.poll() is not None:
+                break
+        assert recorder.wait(30.0) == 1, log.read_text()
+    finally:
+        recorder.kill()
+        recorder.wait()
+    assert "disk is full" in log.read_text()
+    assert "sctn bag recover" in log.read_text()
+    recover = start("sctn", "bag", "recover", tmp_path / "bag.partial", "--out", tmp_path / "copy")
+    assert recover.wait(30.0) == 3, recover.log()
+    numbers = [int(text.data.split()[0]) for _, text in contents(tmp_path / "copy")]
+    assert len(numbers) > 5
+    assert numbers == list(range(len(numbers)))
+
+
+def test_keys_pause_step_and_end_a_play(start, operator: Operator, domain: int, tmp_path: pathlib.Path) -> None:
+    bag = numbered_bag(tmp_path / "bag", count=100, hz=10)
+    heard: list[String] = []
+    operator.node.create_subscription(String, "/chatter", heard.append, DEEP)
+    keyboard, terminal = os.openpty()
+    command = [BINARIES / "sctn", "bag", "play", bag, "--paused", "--wait", "30"]
+    play = subprocess.Popen(command, env=environment(domain), stdin=terminal)
+    try:
+        operator.until(lambda: operator.node.count_publishers("/chatter"), "player", 30.0)
+        operator.spin(2.0)
+        assert heard == [], "it is paused"
+        os.write(keyboard, b"nn")
+        operator.until(lambda: len(heard) == 2, "two messages", 10.0)
+        operator.spin(0.5)
+        assert [text.data for text in heard] == ["0", "1"]
+        os.write(keyboard, b" ")
+        operator.until(lambda: len(heard) > 5, "message after the pause", 10.0)
+        os.write(keyboard, b"q")
+        assert play.wait(30.0) == 0
+        operator.spin(0.5)
+        assert [text.data for text in heard] == [str(index) for index in range(len(heard))]
+        assert len(heard) < 100
+    finally:
+        play.kill()
+        play.wait()
+        os.close(keyboard)
+        os.close(terminal)
+
+
+def test_what_stood_on_latched_topics_is_played_first(start, operator: Operator, tmp_path: pathlib.Path) -> None:
+    bag = tmp_path / "bag"
+    recorder = start("sctn", "bag", "record", "/latched", "/chatter", "--out", bag, "--json")
+    latched = operator.node.create_publisher(String, "/latched", LATCHED)
+    chatter = operator.node.create_publisher(String, "/chatter", DEEP)
+    wait_for_recorder(operator, latched, chatter)
+    for index in range(20):
+        if index < 2:
+            latched.publish(String(data=f"state {index}"))
+        chatter.publish(String(data=str(index)))
+        operator.spin(0.1)
+    operator.spin(0.5)
+    end(recorder)
+    operator.node.destroy_publisher(latched)
+    operator.node.destroy_publisher(chatter)
+    heard: list[tuple[str, str]] = []
+    operator.node.create_subscription(String, "/latched", lambda text: heard.append(("/latched", text.data)), LATCHED)
+    operator.node.create_subscription(String, "/chatter", lambda text: heard.append(("/chatter", text.data)), DEEP)
+    play = start("sctn", "bag", "play", bag, "--start", 1.0, "--wait", 30)
+    operator.until(lambda: play.exit_code is not None, "end of the play", 30.0)
+    assert play.exit_code == 0, play.log()
+    operator.spin(0.5)
+    assert heard[0] == ("/latched", "state 1")
+    assert [topic for topic, _ in heard].count("/latched") == 1
+    assert heard[-1] == ("/chatter", "19")
+
+
+def test_a_bag_of_another_recorder_is_played(start, operator: Operator, tmp_path: pathlib.Path) -> None:
+    bag = numbered_bag(tmp_path / "bag", count=20, hz=50)
+    heard: list[String] = []
+    operator.node.create_subscription(String, "/chatter", heard.append, DEEP)
+    play = start("sctn", "bag", "play", bag, "--wait", 30)
+    operator.until(lambda: len(heard) == 20, "played message", 30.0)
+    assert [int(text.data) for text in heard] == list(range(20))
+    assert play.wait(30.0) == 0, play.log()
+
+
+def numbered_bag(bag: pathlib.Path, count: int, hz: int) -> pathlib.Path:
+    """An SQLite bag of numbers, by rosbags."""
+    text = STORE.types["std_msgs/msg/String"]
+    with Writer(bag, version=9, storage_plugin=StoragePlugin.SQLITE3) as writer:
+        chatter = writer.add_connection("/chatter", text.__msgtype__, typestore=STORE)
+        for index in range(count):
+            writer.write(chatter, 10**9 + index * 10**9 // hz, STORE.serialize_cdr(text(str(index)), text.__msgtype__))
+    return bag
 
 
 @pytest.mark.parametrize("seed", range(KILLS))

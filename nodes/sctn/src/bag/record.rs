@@ -1,6 +1,6 @@
 //! `sctn bag record`.
 
-use super::recorder::{End, Progress, Recorder, RecorderOptions, Selection};
+use super::recorder::{Progress, Recorder, RecorderOptions, Selection};
 use super::{CompressionName, DAMAGED, bytes};
 use crate::plain_node::plain_node;
 use anyhow::{Context as _, Result, bail};
@@ -156,8 +156,11 @@ impl Record {
                 bytes(recording.bytes)
             );
         }
-        let complete = recording.end == End::Asked && recording.lost_in_queue() == 0;
-        Ok(if complete {
+        let shortcoming = recording.shortcoming();
+        if let Some(shortcoming) = &shortcoming {
+            tracing::error!("{}: {shortcoming}", recording.bag.display());
+        }
+        Ok(if shortcoming.is_none() {
             ExitCode::SUCCESS
         } else {
             ExitCode::from(DAMAGED)

@@ -119,9 +119,18 @@ pub struct Recording {
 }
 
 impl Recording {
-    /// Messages that arrived and are not in the bag.
-    pub fn lost_in_queue(&self) -> u64 {
-        self.topics.values().map(|topic| topic.lost_in_queue).sum()
+    /// Why the bag does not hold all that arrived, if so.
+    pub fn shortcoming(&self) -> Option<String> {
+        let lost: u64 = self.topics.values().map(|topic| topic.lost_in_queue).sum();
+        if self.end == End::DiskFull {
+            Some("the disk was full before the end".to_owned())
+        } else if lost > 0 {
+            Some(format!(
+                "{lost} messages found no room on their way to the disk"
+            ))
+        } else {
+            None
+        }
     }
 }
 

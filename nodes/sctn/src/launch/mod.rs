@@ -164,7 +164,13 @@ impl Launch {
         }
         graph.stop(&context).await;
         let bag = match recorder {
-            Some(recorder) => Some(recorder.finish().await?.bag),
+            Some(recorder) => {
+                let recording = recorder.finish().await?;
+                if let Some(shortcoming) = recording.shortcoming() {
+                    bail!("{}: {shortcoming}", recording.bag.display());
+                }
+                Some(recording.bag)
+            }
             None => None,
         };
         if let Some(heightmap) = desk.last_heightmap()?

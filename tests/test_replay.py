@@ -33,7 +33,7 @@ def test_a_recorded_run_gives_the_same_heightmaps_goals_and_proposals_again(star
     parameters = {
         "camera_fusion": [],
         "goal_oracle": ["-p", f"demonstration:={tmp_path / 'run/demonstration'}"],
-        "gctn_policy": ["-p", f"checkpoint:={config / 'checkpoints/placing.safetensors'}"],
+        "gctn_policy": ["-p", f"checkpoint:={config / 'checkpoints/ten_problems.safetensors'}"],
     }
     for node, own in parameters.items():
         common = ["--ros-args", "--params-file", config / f"{node}.yaml", "-p", "use_sim_time:=true"]

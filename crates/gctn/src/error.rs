@@ -110,8 +110,11 @@ pub enum Error {
         source: std::io::Error,
     },
     /// The device cannot be used.
-    #[error("no CUDA device can be used: this libtorch has none, or there is no card")]
-    NoCuda,
+    #[error("no CUDA device can be used: {problem}")]
+    NoCuda {
+        /// Why.
+        problem: String,
+    },
     /// libtorch refused.
     #[error("libtorch: {0}")]
     Torch(#[from] tch::TchError),

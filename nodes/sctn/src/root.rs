@@ -47,7 +47,7 @@ impl Root {
 
     /// The policy that comes with the repository.
     pub fn shipped_checkpoint(&self) -> PathBuf {
-        self.join("config/checkpoints/placing.safetensors")
+        self.join("config/checkpoints/ten_problems.safetensors")
     }
 
     /// The work cell.

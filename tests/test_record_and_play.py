@@ -58,7 +58,7 @@ def test_topics_of_any_type_are_recorded_as_they_appear_and_read_by_rosbags(
     operator.spin(1.0)
     node = operator.node
     latched = node.create_publisher(String, "/latched", LATCHED)
-    # A type that is not among ours: its definition comes from the ROS install.
+    # A type that is not among ours.
     batteries = node.create_publisher(BatteryState, "/cell/battery", DEEP)
     hush = node.create_publisher(String, "/hush", DEEP)
     latched.publish(String(data="before anybody listened"))
@@ -80,6 +80,8 @@ def test_topics_of_any_type_are_recorded_as_they_appear_and_read_by_rosbags(
     assert "/hush" not in topics
     (qos,) = topics["/latched"]["topic_metadata"]["offered_qos_profiles"]
     assert (qos["reliability"], qos["durability"]) == ("reliable", "transient_local")
+    battery_type = "sensor_msgs/msg/BatteryState"
+    assert topics["/cell/battery"]["topic_metadata"]["type_description_hash"] == STORE.hash_rihs01(battery_type)
     assert start("sctn", "bag", "verify", bag).wait(30.0) == 0
 
 

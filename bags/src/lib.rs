@@ -16,7 +16,7 @@ mod sqlite;
 mod verify;
 mod writer;
 
-pub use definition::installed_definition;
+pub use definition::{installed_definition, standard_definition};
 pub use demonstration::{Demonstration, DemonstrationError, DemonstrationStep};
 pub use error::BagError;
 pub use info::{BagInfo, FileInfo, RunInfo, TopicInfo, outcome_name};

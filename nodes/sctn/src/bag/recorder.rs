@@ -546,6 +546,11 @@ impl Writing {
         if let Some(description) = msgs::description(type_name) {
             return self.bag.add_topic(name, description, offered);
         }
+        if let Some((definition, hash)) = bags::standard_definition(type_name) {
+            return self
+                .bag
+                .add_raw_topic(name, type_name, &definition, hash, offered);
+        }
         let definition = bags::installed_definition(type_name).unwrap_or_default();
         if definition.is_empty() {
             tracing::warn!(

@@ -1,9 +1,10 @@
 //! The checks of `cargo xtask test`, in the order in which they run.
 
-use crate::command::{cargo, run};
+use crate::command::{cargo, command, repository_root, run};
 use crate::{libtorch, licences, python};
 use anyhow::{Context as _, Result};
 use clap::ValueEnum;
+use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
 /// One check.
@@ -33,7 +34,14 @@ impl Stage {
                 libtorch::set_up(&python::with_pip()?)?;
                 python::Environment::set_up().map(drop)
             }
-            Self::Fmt => run(cargo().args(["fmt", "--check"])),
+            Self::Fmt => {
+                run(cargo().args(["fmt", "--check"]))?;
+                // Declared by a macro, which cargo fmt does not look into.
+                let modules = rust_files("crates/multiravens/src/tasks")?;
+                run(command("rustfmt")
+                    .args(["--check", "--edition", "2024"])
+                    .args(modules))
+            }
             Self::Licences => licences::check(),
             Self::Clippy => run(cargo().args([
                 "clippy",
@@ -83,6 +91,21 @@ impl Stage {
             .map(|value| value.get_name().to_owned())
             .unwrap_or_default()
     }
+}
+
+/// The Rust files of a folder of the repository.
+fn rust_files(folder: &str) -> Result<Vec<PathBuf>> {
+    let folder = repository_root().join(folder);
+    let entries = std::fs::read_dir(&folder).with_context(|| folder.display().to_string())?;
+    let mut files = Vec::new();
+    for entry in entries {
+        let path = entry?.path();
+        if path.extension().is_some_and(|extension| extension == "rs") {
+            files.push(path);
+        }
+    }
+    files.sort();
+    Ok(files)
 }
 
 /// Builds the nodes and the `sctn` command.

@@ -4,7 +4,7 @@ use crate::render::{RenderError, RgbdImage};
 use crate::stage::Stage;
 use crate::world::{self, World};
 use heightmap::{Camera, Intrinsics, View};
-use pick_place::Robot;
+use pick_place::{ExecuteError, Outcome, PickPlace, PrimitiveSettings, Robot};
 use std::time::Duration;
 use ur5::{JointTrajectory, Joints, WorkCell};
 
@@ -143,6 +143,15 @@ impl Cell {
             suction: false,
             settled: false,
         }
+    }
+
+    /// A work cell with these bodies on its table.
+    #[cfg(test)]
+    pub(crate) fn around(world: &World) -> Self {
+        let work_cell = WorkCell::builtin().expect("the work cell of this repository");
+        let mut cell = Self::new(&work_cell);
+        cell.world = world.clone();
+        cell
     }
 
     /// Clears the table and puts the arm at home, for another episode.
@@ -308,6 +317,27 @@ impl Cell {
         }
     }
 
+    /// Carries out an action on a copy of arm and bodies: how it ends, and the world afterwards, as
+    /// it would be bit for bit.
+    pub fn rehearse(
+        &self,
+        action: &PickPlace,
+        settings: &PrimitiveSettings,
+    ) -> Result<(Outcome, World), ExecuteError<CellError>> {
+        let mut copy = Self {
+            work_cell: self.work_cell.clone(),
+            world: self.world.clone(),
+            joints: self.joints,
+            motion: None,
+            suction: self.suction,
+            settled: self.settled,
+            stage: Stage::new(Vec::new()),
+        };
+        let arm = &self.work_cell.arm;
+        let outcome = pick_place::execute(&mut copy, arm, action, settings, |_| ())?;
+        Ok((outcome, copy.world))
+    }
+
     /// What the cameras see now.
     pub fn render(&mut self) -> Result<&[RgbdImage], RenderError> {
         self.stage
@@ -332,14 +362,18 @@ impl Cell {
         Ok(())
     }
 
-    fn run(
+    /// Carries out a motion to its end, looked at after every physics step.
+    fn run<E: From<CellError>>(
         &mut self,
         trajectory: &JointTrajectory,
         until_contact: bool,
-    ) -> Result<MotionEnd, CellError> {
+        watch: &mut impl FnMut(&mut Self) -> Result<(), E>,
+    ) -> Result<MotionEnd, E> {
         self.begin(trajectory.clone(), until_contact)?;
         loop {
-            if let Tick::Ended(end) = self.tick()? {
+            let tick = self.tick()?;
+            watch(self)?;
+            if let Tick::Ended(end) = tick {
                 return Ok(end);
             }
         }
@@ -354,11 +388,13 @@ impl Robot for Cell {
     }
 
     fn follow(&mut self, trajectory: &JointTrajectory) -> Result<bool, CellError> {
-        Ok(self.run(trajectory, false)? == MotionEnd::Reached)
+        let end = self.run(trajectory, false, &mut |_| Ok::<_, CellError>(()))?;
+        Ok(end == MotionEnd::Reached)
     }
 
     fn follow_until_contact(&mut self, trajectory: &JointTrajectory) -> Result<bool, CellError> {
-        Ok(self.run(trajectory, true)? == MotionEnd::Contact)
+        let end = self.run(trajectory, true, &mut |_| Ok::<_, CellError>(()))?;
+        Ok(end == MotionEnd::Contact)
     }
 
     fn set_suction(&mut self, on: bool) -> Result<(), CellError> {
@@ -368,6 +404,45 @@ impl Robot for Cell {
 
     fn holds(&mut self) -> Result<bool, CellError> {
         Ok(self.is_holding())
+    }
+}
+
+/// A cell as [`Robot`] that is looked at after every physics step: to film it, or to measure.
+pub struct Watched<'a, F> {
+    /// The cell.
+    pub cell: &'a mut Cell,
+    /// What looks; its error ends the motion.
+    pub watch: F,
+}
+
+impl<F, E> Robot for Watched<'_, F>
+where
+    F: FnMut(&mut Cell) -> Result<(), E>,
+    E: From<CellError>,
+{
+    type Error = E;
+
+    fn joints(&mut self) -> Result<Joints, E> {
+        Ok(self.cell.joints)
+    }
+
+    fn follow(&mut self, trajectory: &JointTrajectory) -> Result<bool, E> {
+        let end = self.cell.run(trajectory, false, &mut self.watch)?;
+        Ok(end == MotionEnd::Reached)
+    }
+
+    fn follow_until_contact(&mut self, trajectory: &JointTrajectory) -> Result<bool, E> {
+        let end = self.cell.run(trajectory, true, &mut self.watch)?;
+        Ok(end == MotionEnd::Contact)
+    }
+
+    fn set_suction(&mut self, on: bool) -> Result<(), E> {
+        Cell::set_suction(self.cell, on);
+        Ok(())
+    }
+
+    fn holds(&mut self) -> Result<bool, E> {
+        Ok(self.cell.is_holding())
     }
 }
 
@@ -534,6 +609,36 @@ mod tests {
         assert_eq!(cell.settle(), Err(CellError::Busy));
         assert!(cell.cancel() && !cell.cancel());
         assert_eq!(cell.tick(), Ok(Tick::Idle));
+    }
+
+    #[test]
+    fn a_rehearsal_foretells_the_bits_and_leaves_the_cell_as_it_is() {
+        let mut cell = cell();
+        add_disk(&mut cell, 0.5, 0.0);
+        add_disk(&mut cell, 0.51, 0.08);
+        cell.settle().unwrap();
+        let at = |x, y| Isometry2::new(Vector2::new(x, y), 0.0);
+        // On the rim of the other disk, from where it falls.
+        let action = PickPlace {
+            pick: at(0.505, 0.0),
+            place: at(0.5, 0.05),
+        };
+        let settings = PrimitiveSettings {
+            clearance_m: 0.08,
+            lift_m: 0.05,
+            travel_m_s: 1.2,
+            carry_m_s: 0.8,
+            descend_m_s: 0.2,
+            acceleration_m_s2: 4.0,
+        };
+        let before = cell.world().state_hash();
+        let (outcome, foretold) = cell.rehearse(&action, &settings).unwrap();
+        assert_eq!(cell.world().state_hash(), before);
+        let arm = cell.work_cell().arm.clone();
+        let done = pick_place::execute(&mut cell, &arm, &action, &settings, |_| ()).unwrap();
+        assert_eq!(outcome, done);
+        assert_eq!(foretold.state_hash(), cell.world().state_hash());
+        assert_ne!(foretold.state_hash(), before);
     }
 
     #[test]

@@ -1,6 +1,6 @@
 //! Problems as episodes: reset, observe, step.
 
-use crate::cell::{Cell, CellError};
+use crate::cell::{Cell, CellError, Watched};
 use crate::problem::Problem;
 use crate::render::RenderError;
 use crate::tasks::Task;
@@ -171,18 +171,34 @@ impl Environment {
     pub fn demonstrate(&mut self) -> Option<PickPlace> {
         let index = self.current()?;
         let task = &mut self.tasks[index].task;
-        task.demonstrate(self.cell.world(), &mut self.demonstrator)
+        task.demonstrate(&self.cell, &mut self.demonstrator)
     }
 
     /// Carries out an action with the settings of the module being solved, and assesses it.
     pub fn step(&mut self, action: &PickPlace) -> Result<StepReport, EnvironmentError> {
+        self.step_watched(action, |_| ())
+    }
+
+    /// [`Self::step`], looked at after every physics step.
+    pub fn step_watched(
+        &mut self,
+        action: &PickPlace,
+        mut watch: impl FnMut(&Cell),
+    ) -> Result<StepReport, EnvironmentError> {
         check(action)?;
         let module = self.module();
         let (Some(settings), false) = (self.settings(), self.is_done()) else {
             return Err(EnvironmentError::Over);
         };
         let arm = self.cell.work_cell().arm.clone();
-        let outcome = pick_place::execute(&mut self.cell, &arm, action, &settings, |_| ())?;
+        let mut watched = Watched {
+            cell: &mut self.cell,
+            watch: |cell: &mut Cell| {
+                watch(cell);
+                Ok::<_, CellError>(())
+            },
+        };
+        let outcome = pick_place::execute(&mut watched, &arm, action, &settings, |_| ())?;
         let assessment = self.assess();
         Ok(StepReport {
             outcome,

@@ -3,13 +3,14 @@
 mod cell;
 mod colors;
 mod environment;
+pub mod health;
 mod problem;
 pub mod render;
 mod stage;
 pub mod tasks;
 pub mod world;
 
-pub use cell::{Cell, CellError, MAX_LAG_M, MotionEnd, Tick};
+pub use cell::{Cell, CellError, MAX_LAG_M, MotionEnd, Tick, Watched};
 pub use environment::{Assessment, Environment, EnvironmentError, StepReport};
 pub use problem::{Placement, Problem, ProblemError};
 pub use tasks::{Task, TaskModule};

@@ -21,7 +21,7 @@ fn at(x: f64, y: f64) -> Isometry2<f64> {
 #[test]
 fn demonstrations_wrap_the_chain_round_both_pegs() {
     let mut environment = environment();
-    let seeds = 20;
+    let seeds = 10;
     let mut complete = 0;
     for seed in 0..seeds {
         environment.reset(seed).unwrap();
@@ -87,16 +87,16 @@ const GOLDEN: [(u64, [u64; 3]); 2] = [
         1,
         [
             0x4582_0126_5cbb_41e8,
-            0x316c_9264_8101_ca8c,
-            0x3a4c_3529_8297_cca8,
+            0x66a8_018c_8b6b_86e1,
+            0xce27_4b1f_99cf_008f,
         ],
     ),
     (
         10_000,
         [
             0x20e3_78f9_0297_9492,
-            0xd14b_34b2_6dcc_fbda,
-            0xcf2a_ed83_f296_1d7d,
+            0x6d1e_bdbe_f5bc_ef9e,
+            0x4987_969a_822b_af2b,
         ],
     ),
 ];

@@ -7,12 +7,11 @@ use image::codecs::gif::{GifEncoder, Repeat};
 use image::imageops::{self, FilterType};
 use image::{Delay, DynamicImage, Frame};
 use multiravens::world::STEPS_PER_SECOND;
-use multiravens::{Cell, Environment, MotionEnd, Problem, Tick};
-use pick_place::Robot;
+use multiravens::{Cell, Environment, Problem, Watched};
 use std::fs::File;
 use std::io::BufWriter;
 use std::path::Path;
-use ur5::{JointTrajectory, Joints, WorkCell};
+use ur5::WorkCell;
 
 /// The camera that faces the robot.
 const CAMERA: &str = "front";
@@ -55,9 +54,9 @@ fn draw_problem(problem: &Problem, work_cell: &WorkCell, seed: u64, folder: &Pat
         let Some(action) = environment.demonstrate() else {
             break;
         };
-        let mut filmed = Filmed {
+        let mut filmed = Watched {
             cell: environment.cell_mut(),
-            film: &mut film,
+            watch: |cell: &mut Cell| film.shoot(cell),
         };
         pick_place::execute(&mut filmed, arm, &action, &settings, |_| ())?;
         environment.assess();
@@ -146,49 +145,5 @@ impl Film {
         }
         self.steps += 1;
         Ok(())
-    }
-}
-
-/// A cell before a running camera.
-struct Filmed<'a> {
-    cell: &'a mut Cell,
-    film: &'a mut Film,
-}
-
-impl Filmed<'_> {
-    fn run(&mut self, trajectory: &JointTrajectory, until_contact: bool) -> Result<MotionEnd> {
-        self.cell.begin(trajectory.clone(), until_contact)?;
-        loop {
-            let tick = self.cell.tick()?;
-            self.film.shoot(self.cell)?;
-            if let Tick::Ended(end) = tick {
-                return Ok(end);
-            }
-        }
-    }
-}
-
-impl Robot for Filmed<'_> {
-    type Error = anyhow::Error;
-
-    fn joints(&mut self) -> Result<Joints> {
-        Ok(self.cell.joint_positions())
-    }
-
-    fn follow(&mut self, trajectory: &JointTrajectory) -> Result<bool> {
-        Ok(self.run(trajectory, false)? == MotionEnd::Reached)
-    }
-
-    fn follow_until_contact(&mut self, trajectory: &JointTrajectory) -> Result<bool> {
-        Ok(self.run(trajectory, true)? == MotionEnd::Contact)
-    }
-
-    fn set_suction(&mut self, on: bool) -> Result<()> {
-        self.cell.set_suction(on);
-        Ok(())
-    }
-
-    fn holds(&mut self) -> Result<bool> {
-        Ok(self.cell.is_holding())
     }
 }

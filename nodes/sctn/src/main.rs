@@ -6,6 +6,7 @@ mod curves;
 mod demos;
 mod evaluate;
 mod gallery;
+mod health;
 mod latency;
 mod launch;
 mod picture;
@@ -39,6 +40,8 @@ enum Command {
     Bench(bench::Bench),
     /// Make demonstrations of a problem, and keep the successful ones as bags
     Demos(demos::Demos),
+    /// Check the physics of a problem, and that no policy solves it by accident
+    Health(health::Health),
     /// Train a policy on demonstrations, by a recipe
     Train(train::Train),
     /// Train and test many policies: problems, agents, demonstrations and seeds
@@ -62,6 +65,7 @@ fn main() -> Result<ExitCode> {
         Command::Bag(bag) => return bag.run(),
         Command::Bench(bench) => bench.run(&root()?),
         Command::Demos(demos) => demos.run(&root()?),
+        Command::Health(health) => health.run(&root()?),
         Command::Train(train) => train.run(&root()?),
         Command::Sweep(sweep) => sweep.run(&root()?),
         Command::Table(table) => table.run(&root()?),

@@ -8,9 +8,10 @@
 //! Peg frame: origin half-way between the pegs, x from one to the other, the chain starts on the
 //! side of -y.
 
-use super::{ParameterError, Task, TaskModule, at_height, check_range, read_parameters};
+use super::{ParameterError, Task, TaskModule, at_height, check_range, read_parameters, rehearsed};
+use crate::cell::Cell;
 use crate::colors;
-use crate::world::{BeadChain, Mobility, Part, STEPS_PER_SECOND, Shape, World};
+use crate::world::{BeadChain, Mobility, Part, Shape, World};
 use nalgebra::{Isometry2, Isometry3, Point2, Point3, Rotation2, Vector2};
 use pick_place::{PickPlace, PrimitiveSettings};
 use rand::RngExt;
@@ -19,7 +20,6 @@ use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 use serde_yaml_ng::Value;
 use std::f64::consts::{FRAC_PI_2, FRAC_PI_4, PI, TAU};
-use ur5::Arm;
 
 const PEG_HEIGHT_M: f64 = 0.02;
 const PEG_FRICTION: f64 = 0.3;
@@ -39,24 +39,21 @@ const FOOTPRINT_M: (f64, f64) = (0.3, 0.29);
 const ANGLE_RAD: (f64, f64) = (0.5, 0.85);
 /// ... and leaves this much room between bead and peg.
 const ROOM_M: (f64, f64) = (0.01, 0.016);
-/// It grips a bead and sets it down within this distance of what it means along x and y.
-const NOISE_M: f64 = 1e-3;
-/// Where that fails, it takes a bead next to the peg across it, in a direction turned by at most this.
+/// Where that fails, it tries other directions, ...
+const WIDE_ANGLE_RAD: (f64, f64) = (-0.4, 1.3);
+/// ... beads up to so many further along, ...
+const BEADS_ASIDE: i32 = 4;
+/// ... and beads next to the peg across it, in a direction turned by at most this.
 const ACROSS_RAD: f64 = 0.8;
-/// Moves that are rehearsed, and how many of them before wide guesses.
-const GUESSES: usize = 12;
+/// The first so many guesses are narrow.
 const NARROW_GUESSES: usize = 3;
-/// Rehearsals with noise in which a move has to succeed.
-const REHEARSALS: usize = 2;
-/// A rehearsal ends this long after the release.
-const REST_STEPS: usize = STEPS_PER_SECOND as usize / 2;
 
 const SETTINGS: PrimitiveSettings = PrimitiveSettings {
-    clearance_m: 0.12,
+    clearance_m: 0.09,
     lift_m: 0.045,
     travel_m_s: 1.0,
     carry_m_s: 0.15,
-    descend_m_s: 0.1,
+    descend_m_s: 0.04,
     acceleration_m_s2: 1.5,
 };
 
@@ -338,7 +335,8 @@ impl ChainingTask {
     }
 
     /// A move that may wrap a peg: which bead, and where it goes. The bead that belongs beyond the
-    /// peg goes there; a wide guess takes a bead next to the peg across it.
+    /// peg goes there; a wide guess takes one near it, in a direction that is further off, or one
+    /// next to the peg across it.
     fn guess(
         &self,
         peg: Peg,
@@ -348,54 +346,21 @@ impl ChainingTask {
     ) -> Option<(usize, Point2<f64>)> {
         let center = self.pegs.center(peg);
         let reach = self.pegs.touch_m() + rng.random_range(ROOM_M.0..ROOM_M.1);
-        if wide {
+        let aside = rng.random_range(-BEADS_ASIDE..=BEADS_ASIDE);
+        let near = |bead: usize| (bead as i32 + aside).rem_euclid(beads.len() as i32) as usize;
+        if wide && rng.random_bool(0.5) {
             let off = |bead: &usize| (beads[*bead] - center).norm();
             let nearest = (0..beads.len()).min_by(|a, b| off(a).total_cmp(&off(b)))?;
-            let bead = (nearest + beads.len() + rng.random_range(0..9usize) - 4) % beads.len();
             let turn = Rotation2::new(rng.random_range(-ACROSS_RAD..ACROSS_RAD));
             let across = (center - beads[nearest]).try_normalize(1e-9)?;
-            Some((bead, center + turn * across * reach))
-        } else {
-            let angle = rng.random_range(ANGLE_RAD.0..ANGLE_RAD.1);
-            let outward = Vector2::new(peg.side() * angle.cos(), angle.sin());
-            let bead = self.bead_for(&(center + outward * self.pegs.touch_m()), beads);
-            Some((bead, center + outward * reach))
+            return Some((near(nearest), center + turn * across * reach));
         }
-    }
-
-    /// Carries out a move on a copy of pegs and chain, in the peg frame: how many pegs are wrapped
-    /// when it has come to rest.
-    fn rehearse(
-        &self,
-        beads: &[Point2<f64>],
-        heights: &[f64],
-        pick: &Point2<f64>,
-        place: &Point2<f64>,
-    ) -> usize {
-        let height = heights.iter().copied().fold(0.0, f64::max);
-        let mut tip = Tip {
-            at: Point3::new(pick.x, pick.y, height + 2.0 * BeadChain::BEAD_RADIUS_M),
-        };
-        let mut world = World::new(&tip.pose());
-        let copy: Vec<_> = beads.iter().copied().zip(heights.iter().copied()).collect();
-        let frame = Isometry2::identity();
-        let copy = Self::new(&mut world, &frame, self.pegs, &copy, self.parameters);
-        let below = |p: &Point2<f64>| Point3::new(p.x, p.y, 0.0);
-        tip.travel(&mut world, below(pick), SETTINGS.descend_m_s, true);
-        if !world.grasp() {
-            return 0;
-        }
-        let lifted = tip.at.z + SETTINGS.lift_m;
-        let above = |p: &Point2<f64>| Point3::new(p.x, p.y, lifted);
-        tip.travel(&mut world, above(pick), SETTINGS.carry_m_s, false);
-        tip.travel(&mut world, above(place), SETTINGS.carry_m_s, false);
-        tip.travel(&mut world, below(place), SETTINGS.descend_m_s, true);
-        world.release();
-        tip.travel(&mut world, above(place), SETTINGS.carry_m_s, false);
-        for _ in 0..REST_STEPS {
-            world.step(&tip.pose());
-        }
-        copy.wrapped(&world)
+        let (least, most) = if wide { WIDE_ANGLE_RAD } else { ANGLE_RAD };
+        let angle = rng.random_range(least..most);
+        let outward = Vector2::new(peg.side() * angle.cos(), angle.sin());
+        let bead = self.bead_for(&(center + outward * self.pegs.touch_m()), beads);
+        let bead = if wide { near(bead) } else { bead };
+        Some((bead, center + outward * reach))
     }
 
     /// Whether the chain crosses itself, but for kinks too short to go round a peg.
@@ -468,10 +433,10 @@ impl Task for ChainingTask {
 
     /// Two stages: lifts the bead that belongs beyond a peg over to there, for one peg, then for
     /// the other. Of a few such moves it takes the first that succeeds in rehearsals.
-    fn demonstrate(&mut self, world: &World, rng: &mut ChaCha8Rng) -> Option<PickPlace> {
+    fn demonstrate(&mut self, cell: &Cell, rng: &mut ChaCha8Rng) -> Option<PickPlace> {
+        let world = cell.world();
         let (beads, heights) = self.beads(world);
-        let wrapped = self.wrapped(world);
-        if wrapped == PEGS.len() {
+        if self.wrapped(world) == PEGS.len() {
             return None;
         }
         let open: Vec<_> = PEGS
@@ -479,64 +444,23 @@ impl Task for ChainingTask {
             .filter(|peg| !self.is_wrapped(*peg, &beads, &heights))
             .collect();
         let open = if open.is_empty() { PEGS.to_vec() } else { open };
-        // The move that succeeded in most rehearsals, and how many those were.
-        let mut best: Option<(usize, PickPlace)> = None;
-        for guess in 0..GUESSES {
+        let pose = |p: Point2<f64>| Isometry2::new((self.frame * p).coords, 0.0);
+        let guess = |index: usize, rng: &mut ChaCha8Rng| {
             let peg = *open.choose(rng)?;
-            let (bead, place) = self.guess(peg, guess >= NARROW_GUESSES, &beads, rng)?;
-            let near = |p: Point2<f64>, rng: &mut ChaCha8Rng| {
-                let mut noise = || rng.random_range(-NOISE_M..NOISE_M);
-                p + Vector2::new(noise(), noise())
-            };
-            let good = (0..REHEARSALS).take_while(|_| {
-                let (pick, place) = (near(beads[bead], rng), near(place, rng));
-                self.rehearse(&beads, &heights, &pick, &place) > wrapped
-            });
-            let good = good.count();
-            if best.is_none_or(|(most, _)| good > most) {
-                let pose = |p: Point2<f64>| Isometry2::new((self.frame * p).coords, 0.0);
-                let action = PickPlace {
-                    pick: pose(near(beads[bead], rng)),
-                    place: pose(near(place, rng)),
-                };
-                best = Some((good, action));
-            }
-            if good == REHEARSALS {
-                break;
-            }
-        }
-        best.map(|(_, action)| action)
-    }
-}
-
-/// The suction tip of a rehearsal.
-struct Tip {
-    at: Point3<f64>,
-}
-
-impl Tip {
-    fn pose(&self) -> Isometry3<f64> {
-        Arm::tip_down(&Isometry2::translation(self.at.x, self.at.y), self.at.z)
-    }
-
-    /// Moves in a straight line, to its end or until contact.
-    fn travel(&mut self, world: &mut World, to: Point3<f64>, speed_m_s: f64, until_contact: bool) {
-        let way = to - self.at;
-        let steps = (way.norm() / speed_m_s * f64::from(STEPS_PER_SECOND)).ceil();
-        let start = self.at;
-        for step in 1..=steps as usize {
-            self.at = start + way * (step as f64 / steps);
-            world.step(&self.pose());
-            if until_contact && world.touches() {
-                break;
-            }
-        }
+            let (bead, place) = self.guess(peg, index >= NARROW_GUESSES, &beads, rng)?;
+            Some(PickPlace {
+                pick: pose(beads[bead]),
+                place: pose(place),
+            })
+        };
+        rehearsed(cell, &SETTINGS, rng, guess, |after| self.wrapped(after))
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::world::STEPS_PER_SECOND;
     use rand::SeedableRng;
     use std::collections::BTreeSet;
 
@@ -609,7 +533,7 @@ mod tests {
         rest(&mut world);
         assert_eq!(task.reached(&world), 2);
         let mut rng = ChaCha8Rng::seed_from_u64(0);
-        assert_eq!(task.demonstrate(&world, &mut rng), None);
+        assert_eq!(task.demonstrate(&Cell::around(&world), &mut rng), None);
     }
 
     #[test]
@@ -762,7 +686,7 @@ mod tests {
         let before = world.state_hash();
         let actions = [0, 0, 1].map(|seed| {
             let mut rng = ChaCha8Rng::seed_from_u64(seed);
-            task.demonstrate(&world, &mut rng)
+            task.demonstrate(&Cell::around(&world), &mut rng)
         });
         assert_eq!(actions[0], actions[1]);
         assert_ne!(actions[0], actions[2]);

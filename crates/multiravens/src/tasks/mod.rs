@@ -1,25 +1,31 @@
-//! Task modules: one file each, one line each in [`REGISTRY`].
+//! Task modules: one file each, and one line each in `task_modules!`.
 
-mod chaining;
-mod placing;
-mod routing;
-mod stacking;
-
+use crate::cell::Cell;
 use crate::world::World;
 use nalgebra::{Isometry2, Isometry3, Vector2};
-use pick_place::{PickPlace, PrimitiveSettings};
+use pick_place::{Outcome, PickPlace, PrimitiveSettings};
+use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
 use serde::de::DeserializeOwned;
 use serde_yaml_ng::Value;
 use std::fmt;
 
-/// All task modules: the name in problem files, and what reads their parameters.
-pub const REGISTRY: &[(&str, Configure)] = &[
-    ("chaining", chaining::configure),
-    ("placing", placing::configure),
-    ("routing", routing::configure),
-    ("stacking", stacking::configure),
-];
+/// Declares the files and lists what they configure under their names.
+macro_rules! task_modules {
+    ($($name:ident,)*) => {
+        $(mod $name;)*
+
+        /// All task modules: the name in problem files, and what reads their parameters.
+        pub const REGISTRY: &[(&str, Configure)] = &[$((stringify!($name), $name::configure),)*];
+    };
+}
+
+task_modules! {
+    chaining,
+    placing,
+    routing,
+    stacking,
+}
 
 /// Reads and checks the `parameters` of a module in a problem file.
 pub type Configure = fn(Value) -> Result<Box<dyn TaskModule>, ParameterError>;
@@ -64,7 +70,68 @@ pub trait Task: Send {
 
     /// The next action of a stochastic demonstrator that sees the true state; nothing when there
     /// is nothing left to do.
-    fn demonstrate(&mut self, world: &World, rng: &mut ChaCha8Rng) -> Option<PickPlace>;
+    fn demonstrate(&mut self, cell: &Cell, rng: &mut ChaCha8Rng) -> Option<PickPlace>;
+}
+
+/// Moves that a demonstrator rehearses at most before it takes the best of them.
+const GUESSES: usize = 20;
+/// Rehearsals, each with other noise, in which a move has to succeed.
+const REHEARSALS: usize = 2;
+/// A demonstrator grips and sets down within this distance of what it means along x and y.
+const NOISE_M: f64 = 1e-3;
+
+/// For what cannot be foretold, a cable or a chain: carries out guesses on a copy of the cell until
+/// one reaches exactly one goal more, with noise and again with other noise. Of none, the best.
+///
+/// `guess` is told how many it has made before, and gives none when it has run out; `reached` looks at the world after a rehearsal.
+fn rehearsed(
+    cell: &Cell,
+    settings: &PrimitiveSettings,
+    rng: &mut ChaCha8Rng,
+    mut guess: impl FnMut(usize, &mut ChaCha8Rng) -> Option<PickPlace>,
+    reached: impl Fn(&World) -> usize,
+) -> Option<PickPlace> {
+    let before = reached(cell.world());
+    // By rehearsals that went well, and whether anything is gained.
+    let mut best: Option<((usize, bool), PickPlace)> = None;
+    for index in 0..GUESSES {
+        let Some(meant) = guess(index, rng) else {
+            break;
+        };
+        let moves = [(); REHEARSALS].map(|()| PickPlace {
+            pick: near(&meant.pick, rng),
+            place: near(&meant.place, rng),
+        });
+        let mut good = 0;
+        let mut gains = false;
+        for action in &moves {
+            let after = match cell.rehearse(action, settings) {
+                Ok((Outcome::Placed, world)) => reached(&world),
+                _ => break,
+            };
+            gains = gains || (good == 0 && after > before);
+            if after != before + 1 {
+                break;
+            }
+            good += 1;
+        }
+        if best.is_none_or(|(most, _)| (good, gains) > most) {
+            best = Some(((good, gains), moves[0]));
+        }
+        if good == REHEARSALS {
+            break;
+        }
+    }
+    best.map(|(_, action)| action)
+}
+
+/// A pose with noise.
+fn near(pose: &Isometry2<f64>, rng: &mut ChaCha8Rng) -> Isometry2<f64> {
+    let mut noise = || rng.random_range(-NOISE_M..NOISE_M);
+    Isometry2::new(
+        pose.translation.vector + Vector2::new(noise(), noise()),
+        pose.rotation.angle(),
+    )
 }
 
 /// Reads parameters; a module without any may leave them out.

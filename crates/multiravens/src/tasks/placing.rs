@@ -292,7 +292,8 @@ impl Task for PlacingTask {
 
     /// A random disk that is not placed yet and nothing lies on, to a random free cell of its
     /// parity. The disk is gripped near its centre and set down so that its centre meets the cell's.
-    fn demonstrate(&mut self, world: &World, rng: &mut ChaCha8Rng) -> Option<PickPlace> {
+    fn demonstrate(&mut self, cell: &crate::Cell, rng: &mut ChaCha8Rng) -> Option<PickPlace> {
+        let world = cell.world();
         let mut moves = Vec::new();
         for disk in &self.disks {
             if self.is_placed(disk, world) || self.is_covered(disk, world) {
@@ -375,7 +376,10 @@ mod tests {
             assert_eq!(task.reached(&world), count + 1);
         }
         let mut rng = ChaCha8Rng::seed_from_u64(0);
-        assert_eq!(task.demonstrate(&world, &mut rng), None);
+        assert_eq!(
+            task.demonstrate(&crate::Cell::around(&world), &mut rng),
+            None
+        );
     }
 
     #[test]
@@ -487,7 +491,7 @@ mod tests {
         fn the_demonstrator_brings_a_disk_onto_a_free_cell_of_its_parity(seed in 0u64..1_000_000) {
             let (world, mut task) = scene(seed);
             let mut rng = ChaCha8Rng::seed_from_u64(seed);
-            let action = task.demonstrate(&world, &mut rng).unwrap();
+            let action = task.demonstrate(&crate::Cell::around(&world), &mut rng).unwrap();
             let pick = Point2::from(action.pick.translation.vector);
             let disk = task.disks.iter().find(|d| {
                 (world.position(d.body).xy() - pick).norm() <= 0.25 * d.radius_m + 1e-9

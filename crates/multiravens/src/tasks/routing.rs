@@ -3,11 +3,13 @@
 //!
 //! The cable's left end is anchored; the cable starts on one side of all pegs. Peg after peg, from
 //! left to right, it has to be led past on the far side, the near side, the far side, and to lie
-//! against the peg. At last the yellow end is drawn to its goal.
+//! against the peg; on the near side, where it lies from the start, it has to bend round the peg.
+//! At last the yellow end is drawn to its goal.
 //!
 //! Module frame: the cable runs along +x; the far side is +y, the side on which it starts -y.
 
-use super::{ParameterError, Task, TaskModule, at_height, check_range, read_parameters};
+use super::{ParameterError, Task, TaskModule, at_height, check_range, read_parameters, rehearsed};
+use crate::cell::Cell;
 use crate::colors;
 use crate::world::{BeadChain, BodyId, Mobility, Part, Shape, World};
 use nalgebra::{Isometry2, Isometry3, Point2, Vector2};
@@ -22,33 +24,49 @@ const PEG_RADIUS_M: f64 = 0.012;
 const PEG_HEIGHT_M: f64 = 0.03;
 /// Where the cable is anchored along x; its other end is drawn as far to the other side as it goes.
 const ANCHOR_X_M: f64 = -0.2;
+/// About where the first peg stands.
+const FIRST_X_M: f64 = -0.125;
 /// Distance of the cable's start from the pegs' middle line.
-const START_Y_M: f64 = -0.09;
+const START_Y_M: f64 = -0.115;
 /// A bead's centre passes a peg's centre at this distance when it lies against the peg.
 const PASS_M: f64 = PEG_RADIUS_M + BeadChain::BEAD_RADIUS_M;
 /// The demonstrator leaves this much room between a bead and the peg it passes.
 const ROOM_M: f64 = 0.01;
 /// Cable left over when it is stretched.
 const SLACK_M: f64 = 0.012;
-const FOOTPRINT_M: (f64, f64) = (0.46, 0.28);
+const FOOTPRINT_M: (f64, f64) = (0.48, 0.28);
 /// The demonstrator's picks keep this far from a peg's side, ...
 const CUP_ROOM_M: f64 = 8e-3;
 /// ... but no further than this from the bead's centre.
 const MOST_ASIDE_M: f64 = 3e-3;
+/// A cable goes round a peg, not only past it, if where it comes this near to the peg's middle and
+/// where it leaves ...
+const BEND_ABOUT_M: f64 = 0.045;
+/// ... lie further to the other side than where it touches the peg, by this much.
+const BEND_M: f64 = 5e-3;
+/// To bend the cable round a peg that it passes, the demonstrator draws a bead to here beyond it
+/// along x, and as far to the other side.
+const BEYOND_M: (f64, f64) = (0.04, 0.01);
+/// A lifted bead is set down at most this far beyond the peg along x.
+const AHEAD_M: f64 = 0.03;
+/// The first so many guesses take the bead that should do; later ones a few further along.
+const NARROW_GUESSES: usize = 2;
+/// The stretch is always the same move: more guesses would not help.
+const STRETCHES: usize = 2;
 /// A bead above this height lies on something.
 const ON_TABLE_M: f64 = 1.5 * BeadChain::BEAD_RADIUS_M;
 
 const SETTINGS: PrimitiveSettings = PrimitiveSettings {
-    clearance_m: 0.12,
+    clearance_m: 0.09,
     lift_m: 0.05,
     travel_m_s: 1.0,
     carry_m_s: 0.15,
-    descend_m_s: 0.1,
+    descend_m_s: 0.04,
     acceleration_m_s2: 1.5,
 };
 
-/// For the stretch: lower than the pegs, or the cable would be lifted off the last one.
-const STRETCH: PrimitiveSettings = PrimitiveSettings {
+/// To draw the cable along the table: lower than the pegs, or it would be lifted off them.
+const DRAW: PrimitiveSettings = PrimitiveSettings {
     lift_m: 0.012,
     ..SETTINGS
 };
@@ -111,8 +129,9 @@ struct RoutingTask {
     cable: BeadChain,
     /// Goal of the cable's end, in the module frame.
     end: Point2<f64>,
-    /// Number of pegs routed, in order, when last looked at.
-    routed: usize,
+    /// Whether what comes next is drawn along the table, when last looked at: the cable round a peg
+    /// that it passes on the right side, or its end to the goal.
+    draws: bool,
     parameters: Parameters,
 }
 
@@ -140,13 +159,12 @@ impl Routing {
     ) -> RoutingTask {
         let (least, most) = self.parameters.pegs;
         let count = rng.random_range(least..=most);
-        let spacing = if count == 2 { 0.13 } else { 0.1 };
+        let spacing = if count == 2 { 0.15 } else { 0.105 };
         let pegs: Vec<_> = (0..count)
             .map(|index| {
                 let side = if index % 2 == 0 { 1.0 } else { -1.0 };
-                let x = (index as f64 - (count - 1) as f64 / 2.0) * spacing;
-                let x = x + rng.random_range(-0.012..0.012);
-                let y = side * rng.random_range(0.0..0.02);
+                let x = FIRST_X_M + index as f64 * spacing + rng.random_range(-0.012..0.012);
+                let y = side * rng.random_range(0.01..0.03);
                 Peg {
                     center: Point2::new(x, y),
                     side,
@@ -174,7 +192,7 @@ impl Routing {
         taut.extend(pegs.iter().map(Peg::pass));
         let to_last = length(&taut);
         let last = taut[taut.len() - 1];
-        let reach = Point2::new(rng.random_range(0.17..0.2), 0.0) - last;
+        let reach = Point2::new(rng.random_range(0.185..0.205), 0.0) - last;
         let beads = ((to_last + reach.norm() + SLACK_M) / BeadChain::PITCH_M).ceil() as usize + 1;
         let free = (beads - 1) as f64 * BeadChain::PITCH_M - to_last - SLACK_M;
         let end = last + reach.normalize() * free;
@@ -195,7 +213,7 @@ impl Routing {
             pegs,
             cable,
             end,
-            routed: 0,
+            draws: false,
             parameters: self.parameters,
         }
     }
@@ -242,8 +260,15 @@ impl RoutingTask {
         self.cable.beads.iter().map(local).collect()
     }
 
-    /// Whether the cable is led past a peg on its side, and lies on the table against it.
+    /// Whether the cable is led past a peg on its side, and lies on the table against it. On the
+    /// near side, where it lies from the start, it has to bend round the peg.
     fn is_routed(&self, peg: &Peg, beads: &[(Point2<f64>, f64)]) -> bool {
+        let led = peg.side > 0.0 || self.bends(peg, beads);
+        led && self.passes(peg, beads) && self.is_against(peg, beads)
+    }
+
+    /// Whether the cable is led past a peg on its side.
+    fn passes(&self, peg: &Peg, beads: &[(Point2<f64>, f64)]) -> bool {
         // Seen from the peg, a cable that passes on the far side sweeps about half a turn
         // clockwise, on the near side anticlockwise; one that loops round it, or ends before it,
         // sweeps more or less.
@@ -254,8 +279,20 @@ impl RoutingTask {
                 a.perp(&b).atan2(a.dot(&b))
             })
             .sum();
-        let passed = (0.5 * PI..1.75 * PI).contains(&(-peg.side * sweep));
-        passed && self.is_against(peg, beads)
+        (0.5 * PI..1.75 * PI).contains(&(-peg.side * sweep))
+    }
+
+    /// Whether the cable bends round a peg: comes from the other side and goes back there.
+    fn bends(&self, peg: &Peg, beads: &[(Point2<f64>, f64)]) -> bool {
+        let at = nearest(&peg.pass(), beads);
+        let away = |(p, _): &&(Point2<f64>, f64)| (p - peg.center).norm() > BEND_ABOUT_M;
+        let before = beads[..at].iter().rev().find(away).or(beads.first());
+        let after = beads[at..].iter().find(away).or(beads.last());
+        let (Some((before, _)), Some((after, _))) = (before, after) else {
+            return false;
+        };
+        let inner = |p: &Point2<f64>| peg.side * (peg.pass().y - p.y) > BEND_M;
+        inner(before) && inner(after)
     }
 
     /// Whether a bead lies on the table where the cable should pass a peg.
@@ -263,6 +300,66 @@ impl RoutingTask {
         beads
             .iter()
             .any(|(p, z)| *z < ON_TABLE_M && (p - peg.pass()).norm() < self.parameters.tolerance_m)
+    }
+
+    /// Number of pegs routed, strictly in order.
+    fn routed(&self, beads: &[(Point2<f64>, f64)]) -> usize {
+        let routed = self
+            .pegs
+            .iter()
+            .take_while(|peg| self.is_routed(peg, beads));
+        routed.count()
+    }
+
+    /// Number of goals reached: the pegs in order, the stretch after all of them.
+    fn count(&self, beads: &[(Point2<f64>, f64)]) -> usize {
+        let routed = self.routed(beads);
+        routed + usize::from(routed == self.pegs.len() && self.is_stretched(beads))
+    }
+
+    /// A move that may reach the next goal: which bead, and where it goes.
+    fn guess(
+        &self,
+        index: usize,
+        beads: &[(Point2<f64>, f64)],
+        rng: &mut ChaCha8Rng,
+    ) -> Option<(usize, Point2<f64>)> {
+        let next = self.routed(beads);
+        let Some(peg) = self.pegs.get(next) else {
+            return (index < STRETCHES).then_some((beads.len() - 1, self.end));
+        };
+        // The bead at the peg before, or the anchor; then the way of the cable from there.
+        let held = next
+            .checked_sub(1)
+            .map_or(0, |last| nearest(&self.pegs[last].pass(), beads));
+        let (goal, way) = if self.draws {
+            let (along, across) = BEYOND_M;
+            let goal = peg.center + Vector2::new(along, -peg.side * across);
+            let way = length(&[beads[held].0, peg.pass(), goal]);
+            (goal, way)
+        } else {
+            let along = if index < NARROW_GUESSES {
+                0.0
+            } else {
+                rng.random_range(0.0..AHEAD_M)
+            };
+            let goal = peg.pass() + Vector2::new(along, peg.side * ROOM_M);
+            // While the bead is lifted, the cable has to reach up to it.
+            (goal, SETTINGS.lift_m.hypot((goal - beads[held].0).norm()))
+        };
+        let bead = held + (way / BeadChain::PITCH_M).ceil() as usize + rng.random_range(0..2);
+        let off = if index < NARROW_GUESSES {
+            0
+        } else {
+            rng.random_range(-3i32..=4)
+        };
+        let wished = bead.saturating_add_signed(off as isize);
+        let near = [0, 1, -1, 2, -2, 3].map(|off| wished.saturating_add_signed(off));
+        let bead = near
+            .into_iter()
+            .find(|bead| (1..beads.len()).contains(bead) && self.can_pick(*bead, beads));
+        // Nothing else is left to do but to draw on an end that has folded back.
+        Some(bead.map_or((beads.len() - 1, self.end), |bead| (bead, goal)))
     }
 
     fn is_stretched(&self, beads: &[(Point2<f64>, f64)]) -> bool {
@@ -291,11 +388,7 @@ impl Task for RoutingTask {
     }
 
     fn settings(&self) -> PrimitiveSettings {
-        if self.routed == self.pegs.len() {
-            STRETCH
-        } else {
-            SETTINGS
-        }
+        if self.draws { DRAW } else { SETTINGS }
     }
 
     fn goal_poses(&self) -> Vec<Isometry3<f64>> {
@@ -307,67 +400,39 @@ impl Task for RoutingTask {
         poses.collect()
     }
 
-    /// Pegs count strictly in order, the stretch after all of them.
     fn reached(&mut self, world: &World) -> usize {
         let beads = self.beads(world);
-        let routed = self
-            .pegs
-            .iter()
-            .take_while(|peg| self.is_routed(peg, &beads));
-        self.routed = routed.count();
-        let all = self.routed == self.pegs.len();
-        self.routed + usize::from(all && self.is_stretched(&beads))
+        let routed = self.routed(&beads);
+        let next = self.pegs.get(routed);
+        self.draws = next.is_none_or(|peg| self.passes(peg, &beads));
+        self.count(&beads)
     }
 
-    /// Lifts the bead that belongs against the next peg over to its side of the peg; when all pegs
-    /// are passed, draws the end to its goal.
-    fn demonstrate(&mut self, world: &World, rng: &mut ChaCha8Rng) -> Option<PickPlace> {
-        let beads = self.beads(world);
-        let next = self
-            .pegs
-            .iter()
-            .position(|peg| !self.is_routed(peg, &beads));
-        let (bead, goal) = match next {
-            // The cable lies right, but its end has folded back: draw it on.
-            Some(next)
-                if next + 1 == self.pegs.len() && self.is_against(&self.pegs[next], &beads) =>
-            {
-                (beads.len() - 1, self.end)
-            }
-            Some(next) => {
-                let peg = &self.pegs[next];
-                let goal = peg.pass() + Vector2::new(0.0, peg.side * ROOM_M);
-                // The bead at the peg before, or the anchor.
-                let held = next.checked_sub(1).map_or(0, |last| {
-                    let pass = self.pegs[last].pass();
-                    nearest(&pass, &beads)
-                });
-                // While the bead is lifted, the cable from there has to reach up to it.
-                let way = SETTINGS.lift_m.hypot((goal - beads[held].0).norm());
-                let ideal = held + (way / BeadChain::PITCH_M).ceil() as usize;
-                let ideal = ideal + rng.random_range(0..2);
-                let near = [0, 1, -1, 2, -2, 3].map(|off| ideal.saturating_add_signed(off));
-                let bead = near
-                    .into_iter()
-                    .find(|bead| (1..beads.len()).contains(bead) && self.can_pick(*bead, &beads))?;
-                (bead, goal)
-            }
-            None if !self.is_stretched(&beads) => (beads.len() - 1, self.end),
-            None => return None,
+    /// Lifts the bead that belongs against the next peg over to its side of the peg, or draws the
+    /// cable round a peg that it passes already; when all pegs are done, draws the end to its goal.
+    /// Of a few such moves it takes the first that succeeds in rehearsals.
+    fn demonstrate(&mut self, cell: &Cell, rng: &mut ChaCha8Rng) -> Option<PickPlace> {
+        let beads = self.beads(cell.world());
+        if self.count(&beads) == self.goal_count() {
+            return None;
+        }
+        let guess = |index: usize, rng: &mut ChaCha8Rng| {
+            let (bead, goal) = self.guess(index, &beads, rng)?;
+            // The cup has to come down beside a peg, not on it.
+            let aside = self.pegs.iter().map(|peg| {
+                let off = beads[bead].0 - peg.center;
+                let missing = (PEG_RADIUS_M + CUP_ROOM_M - off.norm()).clamp(0.0, MOST_ASIDE_M);
+                off.normalize() * missing
+            });
+            let aside = aside.sum::<Vector2<f64>>();
+            let pose = |p: Point2<f64>| Isometry2::new((self.anchor * p).coords, 0.0);
+            Some(PickPlace {
+                pick: pose(beads[bead].0 + aside),
+                place: pose(goal + aside),
+            })
         };
-        let noise = Vector2::new(rng.random_range(-1e-3..1e-3), rng.random_range(-1e-3..1e-3));
-        // The cup has to come down beside a peg, not on it.
-        let aside = self.pegs.iter().map(|peg| {
-            let off = beads[bead].0 - peg.center;
-            let missing = (PEG_RADIUS_M + CUP_ROOM_M - off.norm()).clamp(0.0, MOST_ASIDE_M);
-            off.normalize() * missing
-        });
-        let noise = noise + aside.sum::<Vector2<f64>>();
-        let pose = |p: Point2<f64>| Isometry2::new((self.anchor * p).coords, 0.0);
-        Some(PickPlace {
-            pick: pose(beads[bead].0 + noise),
-            place: pose(goal + noise),
-        })
+        let count = |after: &World| self.count(&self.beads(after));
+        rehearsed(cell, &self.settings(), rng, guess, count)
     }
 }
 
@@ -457,6 +522,20 @@ mod tests {
             lie(&mut world, &task, &path, ON_TABLE_Z_M);
             assert_eq!(task.reached(&world), expected, "{sides:?}");
         }
+    }
+
+    #[test]
+    fn a_cable_that_only_passes_a_near_peg_is_not_led_round_it() {
+        let (mut world, mut task) = scene(1, 2);
+        // Past both pegs on the right sides and against them, but on from the second one it goes
+        // where the cable started.
+        let mut path = past(&task, &[1.0; 2]);
+        let last = path.len() - 1;
+        path[last] = path[last - 1] + Vector2::new(0.1, -0.05);
+        lie(&mut world, &task, &path, ON_TABLE_Z_M);
+        let beads = task.beads(&world);
+        assert!(task.passes(&task.pegs[1], &beads) && task.is_against(&task.pegs[1], &beads));
+        assert_eq!(task.reached(&world), 1);
     }
 
     #[test]

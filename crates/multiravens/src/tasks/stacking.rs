@@ -8,6 +8,7 @@
 //! Module frame: the stand is at -x, the array at +x.
 
 use super::{ParameterError, Task, TaskModule, at_height, check_range, read_parameters};
+use crate::cell::Cell;
 use crate::colors;
 use crate::world::{BodyId, Mobility, Part, Shape, World};
 use nalgebra::{Isometry2, Isometry3, Matrix1x3, Point2, Point3, UnitComplex, Vector2, Vector3};
@@ -289,7 +290,8 @@ impl Task for StackingTask {
 
     /// A random block of the lowest row that is not complete, to its goal: gripped near the centre
     /// of its top, and turned no further than it takes.
-    fn demonstrate(&mut self, world: &World, rng: &mut ChaCha8Rng) -> Option<PickPlace> {
+    fn demonstrate(&mut self, cell: &Cell, rng: &mut ChaCha8Rng) -> Option<PickPlace> {
+        let world = cell.world();
         let row = self.row(world)?.iter().filter(|goal| {
             let block = world.position(goal.block);
             let covered = self.is_occupied(block.xy(), block.z, goal.block, world);
@@ -371,7 +373,7 @@ mod tests {
             assert_eq!(task.reached(&world), goal + 1);
         }
         let mut rng = ChaCha8Rng::seed_from_u64(0);
-        assert_eq!(task.demonstrate(&world, &mut rng), None);
+        assert_eq!(task.demonstrate(&Cell::around(&world), &mut rng), None);
     }
 
     #[test]
@@ -395,7 +397,7 @@ mod tests {
         assert_eq!(task.reached(&world), 2);
         // Nor is there a way to go on but to take the tower down.
         let mut rng = ChaCha8Rng::seed_from_u64(0);
-        assert_eq!(task.demonstrate(&world, &mut rng), None);
+        assert_eq!(task.demonstrate(&Cell::around(&world), &mut rng), None);
         // Floating where it should be, with nothing below.
         let (mut world, mut task) = scene(4);
         put(&mut world, &task, 5, 5, EXACT);
@@ -487,7 +489,7 @@ mod tests {
         fn the_demonstrator_turns_a_block_of_the_lowest_row_square_to_the_stand(seed in 0u64..1_000_000) {
             let (mut world, mut task) = scene(seed);
             let mut rng = ChaCha8Rng::seed_from_u64(seed);
-            let action = task.demonstrate(&world, &mut rng).unwrap();
+            let action = task.demonstrate(&Cell::around(&world), &mut rng).unwrap();
             let turn = action.place.rotation.angle();
             prop_assert!(turn.abs() < FRAC_PI_4 + 0.01);
             let goal = task.goals[..3].iter().find(|goal| {

@@ -14,7 +14,7 @@ pub const BEAD_PITCH_M: f64 = 0.01414;
 const BEAD_MASS_KG: f64 = 0.01;
 const BEAD_FRICTION: f64 = 0.4;
 /// A held bead over-pulls its chain no harder than this.
-const BEAD_SUCTION_FORCE_N: f64 = 3.0;
+const BEAD_SUCTION_FORCE_N: f64 = 2.5;
 /// Without damping a chain jitters for seconds, or never rests.
 const LINEAR_DAMPING: f32 = 1.0;
 const ANGULAR_DAMPING: f32 = 5.0;

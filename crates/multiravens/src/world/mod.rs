@@ -73,12 +73,38 @@ struct Body {
 }
 
 /// Bodies on a table whose top is z = 0, and a compliant suction tip.
+///
+/// A clone goes on exactly as the original would, bit for bit.
 pub struct World {
     physics: PhysicsWorld,
     bodies: Vec<Body>,
     chains: Vec<BeadChain>,
     suction: Suction,
     steps: u64,
+}
+
+impl Clone for World {
+    fn clone(&self) -> Self {
+        let physics = &self.physics;
+        Self {
+            physics: PhysicsWorld {
+                gravity: physics.gravity,
+                integration_parameters: physics.integration_parameters,
+                islands: physics.islands.clone(),
+                broad_phase: physics.broad_phase.clone(),
+                narrow_phase: physics.narrow_phase.clone(),
+                bodies: physics.bodies.clone(),
+                colliders: physics.colliders.clone(),
+                impulse_joints: physics.impulse_joints.clone(),
+                // The rest is room to work in, or unused.
+                ..PhysicsWorld::default()
+            },
+            bodies: self.bodies.clone(),
+            chains: self.chains.clone(),
+            suction: self.suction.clone(),
+            steps: self.steps,
+        }
+    }
 }
 
 impl World {
@@ -166,6 +192,11 @@ impl World {
     /// Geometry of a body.
     pub fn shape(&self, body: BodyId) -> Shape {
         self.bodies[body.0].shape
+    }
+
+    /// Whether a body is bolted to the table.
+    pub fn is_fixed(&self, body: BodyId) -> bool {
+        self.bodies[body.0].fixed
     }
 
     /// Colour of a body.

@@ -31,6 +31,7 @@ const LEFT_M: f32 = 0.03;
 const GRASP_DISTANCE_M: f32 = 1e-3;
 const LINEAR: [JointAxis; 3] = [JointAxis::LinX, JointAxis::LinY, JointAxis::LinZ];
 
+#[derive(Clone)]
 pub(super) struct Suction {
     head: RigidBodyHandle,
     tip: RigidBodyHandle,
@@ -41,6 +42,7 @@ pub(super) struct Suction {
     released_at: Option<Vector>,
 }
 
+#[derive(Clone)]
 struct Grip {
     joint: ImpulseJointHandle,
     body: BodyId,

@@ -1,0 +1,60 @@
+//! The physics under policies that know nothing of the task; `sctn health` runs the same at length.
+
+use multiravens::health::{Blind, Checkup, Extremes, check_up};
+use multiravens::{Environment, Problem};
+use std::path::Path;
+use ur5::WorkCell;
+
+fn check_ups(problem: &str, policy: Option<Blind>, seeds: std::ops::Range<u64>) -> Vec<Checkup> {
+    let problems = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../config/problems");
+    let problem = Problem::load(&problems, problem).unwrap();
+    let mut environment = Environment::new(&problem, &WorkCell::builtin().unwrap());
+    seeds
+        .map(|seed| check_up(&mut environment, seed, policy).unwrap())
+        .collect()
+}
+
+#[test]
+fn the_physics_stays_healthy_whatever_is_done() {
+    for problem in ["placing", "stacking", "chaining", "routing"] {
+        for policy in [Some(Blind::Bodies), None] {
+            let bars = Extremes::BARS;
+            for (seed, checkup) in check_ups(problem, policy, 0..2).iter().enumerate() {
+                let (worst, what) = (checkup.extremes, format!("{problem}, {policy:?}, {seed}"));
+                assert!(
+                    worst.joint_error_m < bars.joint_error_m,
+                    "{what}: {worst:?}"
+                );
+                assert!(
+                    worst.depth_in_peg_m < bars.depth_in_peg_m,
+                    "{what}: {worst:?}"
+                );
+                assert!(
+                    worst.depth_in_table_m < bars.depth_in_table_m,
+                    "{what}: {worst:?}"
+                );
+                // Something moved.
+                assert!(
+                    (0.1..bars.speed_m_s).contains(&worst.speed_m_s),
+                    "{what}: {worst:?}"
+                );
+                assert!(checkup.settled && checkup.finite, "{what}");
+                assert_eq!(checkup.failed_steps, 0, "{what}");
+            }
+        }
+    }
+}
+
+#[test]
+fn no_module_is_solved_by_accident() {
+    for problem in ["placing", "stacking", "chaining", "routing"] {
+        for policy in [Blind::Pixels, Blind::Bodies, Blind::Repeat] {
+            for checkup in check_ups(problem, Some(policy), 100..102) {
+                assert!(!checkup.complete, "{problem}, {policy:?}");
+            }
+        }
+    }
+    for checkup in check_ups("routing", Some(Blind::Drag), 100..104) {
+        assert_eq!(checkup.total_reward, 0.0);
+    }
+}

@@ -135,3 +135,123 @@ impl Training {
         Ok(path)
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::recipe::Validation;
+    use crate::sampling::Sampling;
+    use bags::{Demonstration, DemonstrationStep};
+    use gctn::{Compact, Network, NetworkConfig, TrainingConfig};
+    use heightmap::{Heightmap, Workspace};
+    use nalgebra::Isometry2;
+    use pick_place::{Outcome, PickPlace, PrimitiveSettings};
+
+    fn recipe(seed: u64) -> Recipe {
+        Recipe {
+            problems: vec!["placing".into()],
+            demonstrations: 2,
+            network: NetworkConfig {
+                rows: 48,
+                cols: 32,
+                rotations: 8,
+                ..NetworkConfig::new(Network::Compact(Compact {
+                    channels: [4, 4, 8, 8],
+                    window_cells: 5,
+                    ..Compact::default()
+                }))
+            },
+            training: TrainingConfig {
+                seed,
+                steps: 6,
+                ..TrainingConfig::compact()
+            },
+            sampling: Sampling::CompStep,
+            goal_jitter: 0.3,
+            snapshots: 3,
+            validation: Validation {
+                episodes: 0,
+                seed: 1,
+            },
+        }
+    }
+
+    fn data() -> DataSet {
+        let workspace = Workspace {
+            rows: 48,
+            cols: 32,
+            ..Workspace::RAVENS
+        };
+        let observation = |mark: usize| {
+            let mut heightmap = Heightmap::new(workspace);
+            for (index, byte) in heightmap.rgb.iter_mut().enumerate() {
+                *byte = (index * (mark + 3) % 251) as u8;
+            }
+            heightmap
+        };
+        let corner = workspace.origin_m.coords;
+        let pose = |x_m, y_m| Isometry2::new(corner + nalgebra::Vector2::new(x_m, y_m), 0.0);
+        let mut data = DataSet::default();
+        for seed in [0, 2] {
+            let step = |index: usize| DemonstrationStep {
+                observation: observation(index + seed as usize),
+                action: PickPlace {
+                    pick: pose(0.02, 0.03 + 0.01 * index as f64),
+                    place: pose(0.07, 0.1),
+                },
+                settings: PrimitiveSettings::RIGID,
+                module: if index < 2 { "placing" } else { "routing" }.into(),
+                delta_reward: 0.25,
+                outcome: Outcome::Placed,
+            };
+            data.push(Demonstration {
+                problem: "placing".into(),
+                seed,
+                steps: (0..4).map(step).collect(),
+                last: observation(9),
+            })
+            .unwrap();
+        }
+        data
+    }
+
+    /// The bytes of the last snapshot, after a stop at a step and a resume where one is given.
+    fn trained(seed: u64, mut stop: Option<u64>) -> Vec<u8> {
+        let folder = tempfile::tempdir().unwrap();
+        let open = |resume| Training::open(recipe(seed), data(), folder.path(), resume).unwrap();
+        let mut training = open(false);
+        let mut snapshot = None;
+        while !training.is_done() {
+            training.advance().unwrap();
+            if training.is_snapshot_due() {
+                snapshot = Some(training.save_snapshot(&ModelCard::new()).unwrap());
+            }
+            if stop.take_if(|step| *step == training.step()).is_some() {
+                // The steps since the last snapshot are lost, and done again.
+                training = open(true);
+            }
+        }
+        std::fs::read(snapshot.unwrap()).unwrap()
+    }
+
+    #[test]
+    fn one_seed_gives_one_policy_stopped_or_not() {
+        let whole = trained(0, None);
+        assert!(whole == trained(0, None), "twice the same");
+        assert!(
+            whole == trained(0, Some(5)),
+            "stopped after step 5, resumed from 4"
+        );
+        assert!(whole != trained(1, None), "another seed");
+    }
+
+    #[test]
+    fn a_folder_with_a_training_is_not_written_over() {
+        let folder = tempfile::tempdir().unwrap();
+        let mut training = Training::open(recipe(0), data(), folder.path(), false).unwrap();
+        training.advance().unwrap();
+        training.save_snapshot(&ModelCard::new()).unwrap();
+        let error = Training::open(recipe(0), data(), folder.path(), false).unwrap_err();
+        assert!(error.to_string().contains("resume"), "{error}");
+    }
+}

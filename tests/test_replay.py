@@ -19,9 +19,10 @@ COMPARED = ("/heightmap", "/goal", "/pick_place")
 
 
 def test_a_recorded_run_gives_the_same_heightmaps_goals_and_proposals_again(start, tmp_path: pathlib.Path) -> None:
+    checkpoint = REPOSITORY / "config/checkpoints/placing.safetensors"
     launch = start(
         "sctn", "launch", "--problem", "placing", "--seed", 10003, "--operator", "auto", "--processes",
-        "--record", tmp_path / "run", "--record-images", "--json",
+        "--checkpoint", checkpoint, "--record", tmp_path / "run", "--record-images", "--json",
     )  # fmt: skip
     assert launch.wait(400.0) == 0, launch.log()
     outcome = json.loads(launch.output().splitlines()[-1])
@@ -33,13 +34,15 @@ def test_a_recorded_run_gives_the_same_heightmaps_goals_and_proposals_again(star
     parameters = {
         "camera_fusion": [],
         "goal_oracle": ["-p", f"demonstration:={tmp_path / 'run/demonstration'}"],
-        "gctn_policy": ["-p", f"checkpoint:={config / 'checkpoints/ten_problems.safetensors'}"],
+        "gctn_policy": ["-p", f"checkpoint:={checkpoint}"],
     }
     for node, own in parameters.items():
         common = ["--ros-args", "--params-file", config / f"{node}.yaml", "-p", "use_sim_time:=true"]
         start(node, *common, *own, domain=domain)
     replay = tmp_path / "replay"
     record = start("sctn", "bag", "record", *COMPARED, "--out", replay, domain=domain)
+    # The oracle hears everything once it has said its first goal; others subscribe to the same topics.
+    wait_for_messages(bag=replay.with_name("replay.partial"), topic="/goal", count=1)
     play = start(
         "sctn", "bag", "play", outcome["bag"], "--topics", *PLAYED, "--regex", CAMERAS, "--wait", 30, "--json",
         domain=domain,
@@ -75,10 +78,14 @@ def messages(bag: pathlib.Path) -> dict[str, list[bytes]]:
 def wait_for_messages(bag: pathlib.Path, topic: str, count: int, timeout_s: float = 60.0) -> None:
     """Until the unfinished bag holds that many messages of a topic, by what is flushed of it."""
     end = time.monotonic() + timeout_s
+    found = 0
     while time.monotonic() < end:
         names: dict[int, str] = {}
         found = 0
-        (file,) = bag.glob("*.mcap")
+        file = next(bag.glob("*.mcap"), None)
+        if file is None:
+            time.sleep(0.2)
+            continue
         with file.open("rb") as stream:
             try:
                 for record in StreamReader(stream).records:

@@ -285,7 +285,10 @@ async fn hostile_traffic_on_every_topic_and_service_ends_no_node() -> Result<()>
         urdf.clone(),
     ];
     let oracle = [("demonstration", demonstration.display().to_string())];
-    let policy = [("checkpoint", path("config/checkpoints/ten_problems.safetensors"))];
+    let policy = [(
+        "checkpoint",
+        path("config/checkpoints/ten_problems.safetensors"),
+    )];
     let given: [(_, &[(&str, String)]); 5] = [
         ("sim_workcell", &sim),
         ("camera_fusion", &[]),

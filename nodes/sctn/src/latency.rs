@@ -1,6 +1,7 @@
 //! From the last camera frame to the proposal, over DDS through camera_fusion and gctn_policy.
 
 use crate::demos::demonstration;
+use crate::plain_node::NoParameters;
 use crate::root::Root;
 use anyhow::{Context as _, Result, bail};
 use gctn::{Compact, ModelCard, Network, NetworkConfig, Storage, Trainer, TrainingConfig};
@@ -8,8 +9,7 @@ use msgs::convert;
 use msgs::sctn_msgs::{Goal, PickPlace};
 use msgs::tf2_msgs::TFMessage;
 use multiravens::Environment;
-use node_kit::{Context, Node, Parameters, Publisher, Qos, RosArguments, Subscription};
-use serde::{Deserialize, Serialize};
+use node_kit::{Context, Node, Publisher, Qos, RosArguments, Subscription};
 use sim_workcell::frames::{CameraTopics, Frame, camera_transforms};
 use std::time::{Duration, Instant};
 use tokio::runtime::Runtime;
@@ -17,12 +17,6 @@ use tokio::runtime::Runtime;
 /// A domain of its own, on the loopback device only.
 const DOMAIN_ID: u16 = 100;
 const PATIENCE: Duration = Duration::from_secs(10);
-
-#[derive(Default, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-struct NoParameters {}
-
-impl Parameters for NoParameters {}
 
 /// The two nodes, and cameras that show them one scene again and again.
 pub struct Chain {

@@ -4,9 +4,10 @@ use anyhow::Result;
 use node_kit::{Context, Network, Node, Parameters, RosArguments};
 use serde::{Deserialize, Serialize};
 
+/// None but those that every node has.
 #[derive(Default, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
-struct NoParameters {}
+pub struct NoParameters {}
 
 impl Parameters for NoParameters {}
 

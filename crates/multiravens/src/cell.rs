@@ -109,6 +109,27 @@ impl Rest {
     }
 }
 
+/// What an action would do: how it would end, and arm and bodies afterwards.
+pub struct Rehearsal {
+    outcome: Outcome,
+    world: World,
+    joints: Joints,
+    suction: bool,
+    settled: bool,
+}
+
+impl Rehearsal {
+    /// How the action would end.
+    pub fn outcome(&self) -> Outcome {
+        self.outcome
+    }
+
+    /// The bodies afterwards.
+    pub fn world(&self) -> &World {
+        &self.world
+    }
+}
+
 /// A work cell in simulation.
 ///
 /// Simulated time advances in [`Self::tick`] and [`Self::settle`] only. A motion that ends with
@@ -317,13 +338,12 @@ impl Cell {
         }
     }
 
-    /// Carries out an action on a copy of arm and bodies: how it ends, and the world afterwards, as
-    /// it would be bit for bit.
+    /// Carries out an action on a copy of arm and bodies, which goes on as the cell would bit for bit.
     pub fn rehearse(
         &self,
         action: &PickPlace,
         settings: &PrimitiveSettings,
-    ) -> Result<(Outcome, World), ExecuteError<CellError>> {
+    ) -> Result<Rehearsal, ExecuteError<CellError>> {
         let mut copy = Self {
             work_cell: self.work_cell.clone(),
             world: self.world.clone(),
@@ -335,7 +355,22 @@ impl Cell {
         };
         let arm = &self.work_cell.arm;
         let outcome = pick_place::execute(&mut copy, arm, action, settings, |_| ())?;
-        Ok((outcome, copy.world))
+        Ok(Rehearsal {
+            outcome,
+            world: copy.world,
+            joints: copy.joints,
+            suction: copy.suction,
+            settled: copy.settled,
+        })
+    }
+
+    /// Goes on from where a rehearsal ended. It has to be one of this cell in its present state.
+    pub(crate) fn adopt(&mut self, rehearsal: Rehearsal) -> Outcome {
+        self.world = rehearsal.world;
+        self.joints = rehearsal.joints;
+        self.suction = rehearsal.suction;
+        self.settled = rehearsal.settled;
+        rehearsal.outcome
     }
 
     /// What the cameras see now.
@@ -632,13 +667,13 @@ mod tests {
             acceleration_m_s2: 4.0,
         };
         let before = cell.world().state_hash();
-        let (outcome, foretold) = cell.rehearse(&action, &settings).unwrap();
+        let foretold = cell.rehearse(&action, &settings).unwrap();
         assert_eq!(cell.world().state_hash(), before);
         let arm = cell.work_cell().arm.clone();
         let done = pick_place::execute(&mut cell, &arm, &action, &settings, |_| ()).unwrap();
-        assert_eq!(outcome, done);
-        assert_eq!(foretold.state_hash(), cell.world().state_hash());
-        assert_ne!(foretold.state_hash(), before);
+        assert_eq!(foretold.outcome(), done);
+        assert_eq!(foretold.world().state_hash(), cell.world().state_hash());
+        assert_ne!(foretold.world().state_hash(), before);
     }
 
     #[test]

@@ -1,9 +1,9 @@
 //! Problems as episodes: reset, observe, step.
 
-use crate::cell::{Cell, CellError, Watched};
+use crate::cell::{Cell, CellError, Rehearsal, Watched};
 use crate::problem::Problem;
 use crate::render::RenderError;
-use crate::tasks::Task;
+use crate::tasks::{Move, Task};
 use heightmap::{Fusion, FusionError, Heightmap, View, Workspace};
 use nalgebra::Isometry2;
 use pick_place::{ExecuteError, Outcome, PickPlace, PrimitiveSettings};
@@ -24,6 +24,8 @@ pub struct Environment {
     cell: Cell,
     tasks: Vec<Progress>,
     demonstrator: ChaCha8Rng,
+    /// What the demonstrator's last action does in the present state, if it has rehearsed it.
+    foretold: Option<(PickPlace, Rehearsal)>,
     seed: u64,
     steps: usize,
     fusion: Fusion,
@@ -125,6 +127,7 @@ impl Environment {
             cell: Cell::new(work_cell),
             tasks: Vec::new(),
             demonstrator: ChaCha8Rng::seed_from_u64(0),
+            foretold: None,
             seed: 0,
             steps: 0,
             fusion: Fusion::default(),
@@ -138,6 +141,7 @@ impl Environment {
         self.steps = 0;
         self.tasks.clear();
         self.cell.clear();
+        self.foretold = None;
         self.demonstrator = stream(seed, DEMONSTRATOR_STREAM);
         for (index, placement) in self.problem.modules().iter().enumerate() {
             let mut rng = stream(seed, index as u64);
@@ -171,34 +175,54 @@ impl Environment {
     pub fn demonstrate(&mut self) -> Option<PickPlace> {
         let index = self.current()?;
         let task = &mut self.tasks[index].task;
-        task.demonstrate(&self.cell, &mut self.demonstrator)
+        let Move { action, rehearsal } = task.demonstrate(&self.cell, &mut self.demonstrator)?;
+        self.foretold = rehearsal.map(|rehearsal| (action, rehearsal));
+        Some(action)
     }
 
-    /// Carries out an action with the settings of the module being solved, and assesses it.
+    /// Carries out an action with the settings of the module being solved, and assesses it. What the
+    /// demonstrator has just rehearsed is not simulated again.
     pub fn step(&mut self, action: &PickPlace) -> Result<StepReport, EnvironmentError> {
-        self.step_watched(action, |_| ())
+        match self.foretold.take() {
+            Some((foretold, rehearsal)) if foretold == *action => {
+                self.step_by(action, |cell, _| Ok(cell.adopt(rehearsal)))
+            }
+            _ => self.step_watched(action, |_| ()),
+        }
     }
 
-    /// [`Self::step`], looked at after every physics step.
+    /// [`Self::step`], simulated and looked at after every physics step.
     pub fn step_watched(
         &mut self,
         action: &PickPlace,
         mut watch: impl FnMut(&Cell),
+    ) -> Result<StepReport, EnvironmentError> {
+        self.foretold = None;
+        self.step_by(action, |cell, settings| {
+            let arm = cell.work_cell().arm.clone();
+            let watch = |cell: &mut Cell| {
+                watch(cell);
+                Ok::<_, CellError>(())
+            };
+            let mut watched = Watched { cell, watch };
+            pick_place::execute(&mut watched, &arm, action, settings, |_| ())
+        })
+    }
+
+    fn step_by(
+        &mut self,
+        action: &PickPlace,
+        carry_out: impl FnOnce(
+            &mut Cell,
+            &PrimitiveSettings,
+        ) -> Result<Outcome, ExecuteError<CellError>>,
     ) -> Result<StepReport, EnvironmentError> {
         check(action)?;
         let module = self.module();
         let (Some(settings), false) = (self.settings(), self.is_done()) else {
             return Err(EnvironmentError::Over);
         };
-        let arm = self.cell.work_cell().arm.clone();
-        let mut watched = Watched {
-            cell: &mut self.cell,
-            watch: |cell: &mut Cell| {
-                watch(cell);
-                Ok::<_, CellError>(())
-            },
-        };
-        let outcome = pick_place::execute(&mut watched, &arm, action, &settings, |_| ())?;
+        let outcome = carry_out(&mut self.cell, &settings)?;
         let assessment = self.assess();
         Ok(StepReport {
             outcome,
@@ -296,6 +320,7 @@ impl Environment {
 
     /// The simulated hardware, for a node that drives it.
     pub fn cell_mut(&mut self) -> &mut Cell {
+        self.foretold = None;
         &mut self.cell
     }
 

@@ -1,6 +1,6 @@
 //! What the physics does at its worst, under policies that know nothing of the task.
 
-use crate::cell::CellError;
+use crate::cell::{Cell, CellError};
 use crate::environment::{Environment, EnvironmentError};
 use crate::world::{BodyId, Shape, World};
 use heightmap::{Pixel, Workspace};
@@ -180,23 +180,32 @@ pub fn check_up(
         finite: true,
         ..Checkup::default()
     };
-    let first = environment.demonstrate();
-    let mut next = (policy.is_none()).then_some(first).flatten();
+    checkup.extremes.look(environment.cell().world());
+    let mut repeated = None;
     for _ in 0..environment.max_steps() {
         if environment.is_done() {
             break;
         }
         let action = match policy {
-            Some(Blind::Repeat) => first,
+            Some(Blind::Repeat) => {
+                repeated = repeated.or_else(|| environment.demonstrate());
+                repeated
+            }
             Some(policy) => policy.act(environment, &mut rng),
-            None => next.take().or_else(|| environment.demonstrate()),
+            None => environment.demonstrate(),
         };
         // A policy that aims at a body beside the table has nothing to do in this step.
         let Some(action) = action else {
             continue;
         };
         let extremes = &mut checkup.extremes;
-        match environment.step_watched(&action, |cell| extremes.look(cell.world())) {
+        let watch = |cell: &Cell| {
+            // What does not move was looked at before.
+            if cell.world().fastest_m_s() > 0.0 {
+                extremes.look(cell.world());
+            }
+        };
+        match environment.step_watched(&action, watch) {
             Ok(report) => checkup.settled &= report.settled,
             Err(
                 EnvironmentError::Cell(CellError::Broken)

@@ -10,7 +10,7 @@ mod stage;
 pub mod tasks;
 pub mod world;
 
-pub use cell::{Cell, CellError, MAX_LAG_M, MotionEnd, Tick, Watched};
+pub use cell::{Cell, CellError, MAX_LAG_M, MotionEnd, Rehearsal, Tick, Watched};
 pub use environment::{Assessment, Environment, EnvironmentError, StepReport};
 pub use problem::{Placement, Problem, ProblemError};
-pub use tasks::{Task, TaskModule};
+pub use tasks::{Move, Task, TaskModule};

@@ -2,7 +2,6 @@
 
 mod episode;
 
-use episode::demonstration;
 use multiravens::{Environment, EnvironmentError};
 use nalgebra::{Isometry2, Vector2};
 use pick_place::PickPlace;
@@ -33,41 +32,6 @@ fn demonstrations_route_the_cable_peg_by_peg() {
     }
     assert!(complete * 100 >= seeds * 95, "{complete} of {seeds}");
     assert!(one_by_one * 100 >= seeds * 90, "{one_by_one} of {seeds}");
-}
-
-/// Any change of these numbers changes what every recorded demonstration shows: make sure that it
-/// is meant, then copy the new ones from the failure.
-const GOLDEN: [(u64, [u64; 3]); 2] = [
-    (
-        1,
-        [
-            0x84c7_9a13_d8e2_2088,
-            0x0300_c413_ce1a_3d70,
-            0x2aaa_13b6_6316_7fb3,
-        ],
-    ),
-    (
-        10_000,
-        [
-            0x38ac_0793_d7eb_b79c,
-            0xa276_3233_27c9_ec0f,
-            0xdeb1_9d8a_086c_5bee,
-        ],
-    ),
-];
-
-#[test]
-fn a_seed_gives_the_same_bits_on_any_thread() {
-    let play = |seed| {
-        let mut environment = environment();
-        (seed, demonstration(&mut environment, seed))
-    };
-    let here = GOLDEN.map(|(seed, _)| play(seed));
-    assert_eq!(here, GOLDEN, "{here:#x?}");
-    let threads = GOLDEN.map(|golden| (golden, std::thread::spawn(move || play(golden.0))));
-    for (golden, thread) in threads {
-        assert_eq!(thread.join().unwrap(), golden);
-    }
 }
 
 #[test]

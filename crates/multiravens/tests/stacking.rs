@@ -2,7 +2,6 @@
 
 mod episode;
 
-use episode::demonstration;
 use multiravens::Environment;
 use nalgebra::{Isometry2, Vector2};
 use pick_place::{Outcome, PickPlace};
@@ -31,45 +30,6 @@ fn demonstrations_build_the_pyramid_block_by_block() {
         }
         assert!(environment.is_complete(), "seed {seed}");
         assert_eq!(environment.steps(), 6);
-    }
-}
-
-/// Any change of these numbers changes what every recorded demonstration shows: make sure that it
-/// is meant, then copy the new ones from the failure.
-const GOLDEN: [(u64, [u64; 3]); 2] = [
-    (
-        1,
-        [
-            0x055a_7bee_bd74_ab5b,
-            0xc3c9_814e_491e_3c60,
-            0xd9f3_8c44_5fa1_3e77,
-        ],
-    ),
-    (
-        10_000,
-        [
-            0x439f_ff9c_e7fc_5dbb,
-            0x49df_0323_44d0_cfaf,
-            0xb206_c709_f382_51ff,
-        ],
-    ),
-];
-
-#[test]
-fn a_seed_gives_the_same_bits_on_any_thread_and_in_any_order() {
-    let mut here = environment();
-    let hashes = GOLDEN.map(|(seed, _)| (seed, demonstration(&mut here, seed)));
-    assert_eq!(hashes, GOLDEN, "{hashes:#x?}");
-    // Backwards, each beside the other.
-    let threads = GOLDEN.map(|(seed, expected)| {
-        std::thread::spawn(move || {
-            let mut there = environment();
-            there.reset(seed + 7).unwrap();
-            assert_eq!(demonstration(&mut there, seed), expected);
-        })
-    });
-    for thread in threads {
-        thread.join().unwrap();
     }
 }
 

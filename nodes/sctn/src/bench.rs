@@ -1,14 +1,16 @@
-//! `sctn bench`: the inner loops, timed by criterion.
+//! `sctn bench`: the inner loops, timed by criterion, and what demonstrations cost.
 
 use crate::demos::demonstration;
 use crate::latency::Chain;
 use crate::root::Root;
 use anyhow::{Context, Result, bail};
 use clap::Args;
+use cpu_time::ThreadTime;
 use criterion::Criterion;
 use gctn::{NetworkConfig, Policy, Trainer, TrainingConfig};
 use heightmap::{Fusion, Heightmap, View, Workspace};
-use multiravens::Environment;
+use multiravens::{Environment, Problem};
+use sctn::demonstrate;
 use serde::Serialize;
 use std::collections::BTreeMap;
 use std::hint::black_box;
@@ -18,8 +20,11 @@ use std::time::Duration;
 /// Arguments of `sctn bench`.
 #[derive(Args)]
 pub struct Bench {
-    /// Only benchmarks whose name contains this
+    /// Only benchmarks whose name contains this; those of problems are called demonstration_PROBLEM
     name: Option<String>,
+    /// Demonstrations of each problem
+    #[arg(long, default_value_t = 10)]
+    demonstrations: u64,
     /// Print a JSON object last
     #[arg(long)]
     json: bool,
@@ -69,13 +74,6 @@ const WORKLOADS: &[Workload] = &[
         run: physics_step,
     },
     Workload {
-        name: "demonstration_placing",
-        threads: 1,
-        original_s: None,
-        samples: 10,
-        run: demonstration_placing,
-    },
-    Workload {
         name: "decision_compact",
         threads: 1,
         original_s: Some(5.26),
@@ -105,15 +103,46 @@ struct Figure {
     original_s: Option<f64>,
 }
 
+/// Reset and one demonstration in the original (PyBullet), where it was measured.
+const ORIGINAL_DEMONSTRATIONS_S: [(&str, f64); 3] =
+    [("stacking", 16.0), ("routing", 13.9), ("chaining", 41.0)];
+
+/// What demonstrations of a problem cost with reset, rendering and fusion, on one thread.
+#[derive(Serialize)]
+struct Cost {
+    episodes: u64,
+    successes: u64,
+    /// Processor time of all episodes, by successful ones.
+    cpu_s: f64,
+    /// Wall time of 1,000 successful ones on two cores, at that.
+    thousand_on_two_cores_s: f64,
+    original_s: Option<f64>,
+}
+
+#[derive(Serialize)]
+struct Report {
+    inner_loops: BTreeMap<&'static str, Figure>,
+    demonstrations: BTreeMap<String, Cost>,
+}
+
 impl Bench {
     pub fn run(self, root: &Root) -> Result<()> {
-        let chosen: Vec<_> = WORKLOADS
+        let wanted = |name: &str| self.name.as_ref().is_none_or(|part| name.contains(part));
+        let chosen: Vec<_> = WORKLOADS.iter().filter(|w| wanted(w.name)).collect();
+        let problems = root.join("config/problems");
+        let problems = Problem::names(&problems).with_context(|| problems.display().to_string())?;
+        let benchmark = |problem: &String| format!("demonstration_{problem}");
+        let shown = problems
             .iter()
-            .filter(|w| self.name.as_ref().is_none_or(|name| w.name.contains(name)))
-            .collect();
-        if chosen.is_empty() {
-            let names: Vec<_> = WORKLOADS.iter().map(|workload| workload.name).collect();
+            .filter(|problem| wanted(&benchmark(problem)));
+        let shown: Vec<_> = shown.collect();
+        if chosen.is_empty() && shown.is_empty() {
+            let names = WORKLOADS.iter().map(|workload| workload.name.to_owned());
+            let names: Vec<_> = names.chain(problems.iter().map(benchmark)).collect();
             bail!("no benchmark of that name; there are: {}", names.join(", "));
+        }
+        if self.demonstrations == 0 {
+            bail!("--demonstrations: expected at least one");
         }
         let output = tempfile::tempdir().context("folder for criterion's files")?;
         let mut figures = BTreeMap::new();
@@ -141,24 +170,81 @@ impl Bench {
                 },
             );
         }
+        let costs = shown.into_iter().map(|problem| {
+            let cost = Cost::measure(root, problem, self.demonstrations);
+            cost.map(|cost| (problem.clone(), cost))
+        });
+        let report = Report {
+            inner_loops: figures,
+            demonstrations: costs.collect::<Result<_>>()?,
+        };
         if self.json {
-            println!("{}", serde_json::to_string(&figures)?);
-            return Ok(());
+            println!("{}", serde_json::to_string(&report)?);
+        } else {
+            report.print();
         }
-        // The originals ran on another machine: no ratio is claimed.
-        println!(
-            "{:24} {:>12} {:>8} {:>12}",
-            "benchmark", "median", "threads", "original"
-        );
-        for (name, figure) in &figures {
-            let original = figure.original_s.map_or_else(|| "-".to_owned(), time);
-            let median = time(figure.median_s);
+        Ok(())
+    }
+}
+
+impl Cost {
+    fn measure(root: &Root, problem: &str, episodes: u64) -> Result<Self> {
+        let mut environment = Environment::new(&root.problem(problem)?, &root.work_cell()?);
+        let mut successes = 0;
+        let started = ThreadTime::now();
+        for index in 0..episodes {
+            let rollout = demonstrate(&mut environment, SEED + 2 * index)?;
+            successes += u64::from(rollout.complete);
+        }
+        if successes == 0 {
+            bail!("no demonstration of {problem} succeeded");
+        }
+        let cpu_s = started.elapsed().as_secs_f64() / successes as f64;
+        let original = ORIGINAL_DEMONSTRATIONS_S
+            .iter()
+            .find(|(name, _)| *name == problem);
+        Ok(Self {
+            episodes,
+            successes,
+            cpu_s,
+            thousand_on_two_cores_s: 1000.0 * cpu_s / 2.0,
+            original_s: original.map(|(_, seconds)| *seconds),
+        })
+    }
+}
+
+impl Report {
+    /// The originals ran on another machine: no ratio is claimed.
+    fn print(&self) {
+        let original = |seconds: Option<f64>| seconds.map_or_else(|| "-".to_owned(), time);
+        if !self.inner_loops.is_empty() {
             println!(
-                "{name:24} {median:>12} {:>8} {original:>12}",
+                "{:26} {:>10} {:>8} {:>10}",
+                "inner loop", "median", "threads", "original"
+            );
+        }
+        for (name, figure) in &self.inner_loops {
+            let (median, original) = (time(figure.median_s), original(figure.original_s));
+            println!(
+                "{name:26} {median:>10} {:>8} {original:>10}",
                 figure.threads
             );
         }
-        Ok(())
+        if !self.demonstrations.is_empty() {
+            println!(
+                "{:26} {:>10} {:>8} {:>10} {:>17}",
+                "demonstration", "CPU time", "success", "original", "1,000 on 2 cores"
+            );
+        }
+        for (name, cost) in &self.demonstrations {
+            println!(
+                "{name:26} {:>10} {:>8} {:>10} {:>13.1} min",
+                time(cost.cpu_s),
+                format!("{}/{}", cost.successes, cost.episodes),
+                original(cost.original_s),
+                cost.thousand_on_two_cores_s / 60.0
+            );
+        }
     }
 }
 
@@ -218,15 +304,6 @@ fn physics_step(root: &Root, criterion: &mut Criterion, name: &str) -> Result<()
     let tip = arm.tip(&arm.home);
     let world = environment.cell_mut().world_mut();
     criterion.bench_function(name, |b| b.iter(|| world.step(&tip)));
-    Ok(())
-}
-
-fn demonstration_placing(root: &Root, criterion: &mut Criterion, name: &str) -> Result<()> {
-    let (problem, work_cell) = (root.problem("placing")?, root.work_cell()?);
-    demonstration(&problem, &work_cell, SEED)?;
-    criterion.bench_function(name, |b| {
-        b.iter(|| demonstration(&problem, &work_cell, SEED))
-    });
     Ok(())
 }
 

@@ -8,7 +8,7 @@
 //! Peg frame: origin half-way between the pegs, x from one to the other, the chain starts on the
 //! side of -y.
 
-use super::{ParameterError, Task, TaskModule, at_height, check_range, read_parameters, rehearsed};
+use super::{Move, ParameterError, Task, TaskModule, at_height, check_range, rehearsed};
 use crate::cell::Cell;
 use crate::colors;
 use crate::world::{BeadChain, Mobility, Part, Shape, World};
@@ -17,8 +17,7 @@ use pick_place::{PickPlace, PrimitiveSettings};
 use rand::RngExt;
 use rand::seq::IndexedRandom;
 use rand_chacha::ChaCha8Rng;
-use serde::{Deserialize, Serialize};
-use serde_yaml_ng::Value;
+use serde::Deserialize;
 use std::f64::consts::{FRAC_PI_2, FRAC_PI_4, PI, TAU};
 
 const PEG_HEIGHT_M: f64 = 0.02;
@@ -57,10 +56,10 @@ const SETTINGS: PrimitiveSettings = PrimitiveSettings {
     acceleration_m_s2: 1.5,
 };
 
-/// Parameters of the module in a problem file.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+/// The module's parameters in a problem file.
+#[derive(Clone, Copy, Debug, Deserialize)]
 #[serde(deny_unknown_fields, default)]
-struct Parameters {
+pub(super) struct Chaining {
     /// Distances of the pegs' axes to choose from, in m.
     distances_m: [f64; 2],
     /// Radii of the pegs to choose from, in m.
@@ -71,7 +70,7 @@ struct Parameters {
     tolerance_m: f64,
 }
 
-impl Default for Parameters {
+impl Default for Chaining {
     fn default() -> Self {
         Self {
             distances_m: [0.11, 0.14],
@@ -80,26 +79,6 @@ impl Default for Parameters {
             tolerance_m: 0.02,
         }
     }
-}
-
-/// Reads the module's parameters.
-pub(super) fn configure(parameters: Value) -> Result<Box<dyn TaskModule>, ParameterError> {
-    let parameters: Parameters = read_parameters(parameters)?;
-    // Within these a chain has 31 to 37 beads and all keeps to the footprint.
-    for distance in parameters.distances_m {
-        check_range("distances_m", distance, 0.11, 0.14)?;
-    }
-    for radius in parameters.radii_m {
-        check_range("radii_m", radius, 0.015, 0.02)?;
-    }
-    check_range("turn_rad", parameters.turn_rad, 0.0, FRAC_PI_4)?;
-    check_range("tolerance_m", parameters.tolerance_m, 5e-3, 0.03)?;
-    Ok(Box::new(Chaining { parameters }))
-}
-
-#[derive(Debug)]
-struct Chaining {
-    parameters: Parameters,
 }
 
 /// Where the pegs are; everything in the peg frame.
@@ -184,10 +163,22 @@ struct ChainingTask {
     frame: Isometry2<f64>,
     pegs: Pegs,
     chain: BeadChain,
-    parameters: Parameters,
+    parameters: Chaining,
 }
 
 impl TaskModule for Chaining {
+    fn check(&self) -> Result<(), ParameterError> {
+        // Within these a chain has 31 to 37 beads and all keeps to the footprint.
+        for distance in self.distances_m {
+            check_range("distances_m", distance, 0.11, 0.14)?;
+        }
+        for radius in self.radii_m {
+            check_range("radii_m", radius, 0.015, 0.02)?;
+        }
+        check_range("turn_rad", self.turn_rad, 0.0, FRAC_PI_4)?;
+        check_range("tolerance_m", self.tolerance_m, 5e-3, 0.03)
+    }
+
     fn footprint_m(&self) -> Vector2<f64> {
         Vector2::new(FOOTPRINT_M.0, FOOTPRINT_M.1)
     }
@@ -209,12 +200,11 @@ impl Chaining {
         anchor: &Isometry2<f64>,
         rng: &mut ChaCha8Rng,
     ) -> ChainingTask {
-        let parameters = self.parameters;
         let pegs = Pegs {
-            distance_m: parameters.distances_m[rng.random_range(0..2)],
-            radius_m: parameters.radii_m[rng.random_range(0..2)],
+            distance_m: self.distances_m[rng.random_range(0..2)],
+            radius_m: self.radii_m[rng.random_range(0..2)],
         };
-        let turn = parameters.turn_rad * rng.random_range(-1.0..=1.0);
+        let turn = self.turn_rad * rng.random_range(-1.0..=1.0);
         let frame =
             anchor * Isometry2::new(Vector2::zeros(), turn) * Isometry2::translation(0.0, OFFSET_M);
         let width = rng.random_range(OVAL_WIDTH_M.0..OVAL_WIDTH_M.1);
@@ -227,7 +217,7 @@ impl Chaining {
             .into_iter()
             .map(|p| (p + middle, BeadChain::BEAD_RADIUS_M))
             .collect();
-        ChainingTask::new(world, &frame, pegs, &centers, parameters)
+        ChainingTask::new(world, &frame, pegs, &centers, *self)
     }
 }
 
@@ -283,7 +273,7 @@ impl ChainingTask {
         frame: &Isometry2<f64>,
         pegs: Pegs,
         beads: &[(Point2<f64>, f64)],
-        parameters: Parameters,
+        parameters: Chaining,
     ) -> Self {
         for peg in PEGS {
             let pose = frame * Isometry2::from(pegs.center(peg).coords);
@@ -433,7 +423,7 @@ impl Task for ChainingTask {
 
     /// Two stages: lifts the bead that belongs beyond a peg over to there, for one peg, then for
     /// the other. Of a few such moves it takes the first that succeeds in rehearsals.
-    fn demonstrate(&mut self, cell: &Cell, rng: &mut ChaCha8Rng) -> Option<PickPlace> {
+    fn demonstrate(&mut self, cell: &Cell, rng: &mut ChaCha8Rng) -> Option<Move> {
         let world = cell.world();
         let (beads, heights) = self.beads(world);
         if self.wrapped(world) == PEGS.len() {
@@ -472,9 +462,7 @@ mod tests {
 
     fn drawn(seed: u64) -> (World, ChainingTask) {
         let mut world = World::new(&away());
-        let module = Chaining {
-            parameters: Parameters::default(),
-        };
+        let module = Chaining::default();
         let anchor = Isometry2::new(Vector2::new(0.5, 0.35), 0.0);
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
         let task = module.draw(&mut world, &anchor, &mut rng);
@@ -492,8 +480,7 @@ mod tests {
     fn laid(beads: &[(Point2<f64>, f64)]) -> (World, ChainingTask) {
         let mut world = World::new(&away());
         let frame = Isometry2::new(Vector2::new(0.5, 0.3), 0.4);
-        let parameters = Parameters::default();
-        let task = ChainingTask::new(&mut world, &frame, pegs(), beads, parameters);
+        let task = ChainingTask::new(&mut world, &frame, pegs(), beads, Chaining::default());
         (world, task)
     }
 
@@ -533,7 +520,8 @@ mod tests {
         rest(&mut world);
         assert_eq!(task.reached(&world), 2);
         let mut rng = ChaCha8Rng::seed_from_u64(0);
-        assert_eq!(task.demonstrate(&Cell::around(&world), &mut rng), None);
+        let next = task.demonstrate(&Cell::around(&world), &mut rng);
+        assert!(next.is_none());
     }
 
     #[test]
@@ -687,6 +675,7 @@ mod tests {
         let actions = [0, 0, 1].map(|seed| {
             let mut rng = ChaCha8Rng::seed_from_u64(seed);
             task.demonstrate(&Cell::around(&world), &mut rng)
+                .map(|next| next.action)
         });
         assert_eq!(actions[0], actions[1]);
         assert_ne!(actions[0], actions[2]);
@@ -703,7 +692,7 @@ mod tests {
             ("{beads: 12}", "beads"),
         ] {
             let value = serde_yaml_ng::from_str(text).unwrap();
-            let error = configure(value).unwrap_err();
+            let error = crate::tasks::configure::<Chaining>(value).unwrap_err();
             assert!(error.to_string().contains(name), "{error}");
         }
     }

@@ -1,6 +1,6 @@
 //! Task modules: one file each, and one line each in `task_modules!`.
 
-use crate::cell::Cell;
+use crate::cell::{Cell, Rehearsal};
 use crate::world::World;
 use nalgebra::{Isometry2, Isometry3, Vector2};
 use pick_place::{Outcome, PickPlace, PrimitiveSettings};
@@ -10,25 +10,39 @@ use serde::de::DeserializeOwned;
 use serde_yaml_ng::Value;
 use std::fmt;
 
-/// Declares the files and lists what they configure under their names.
+/// Declares the files and lists, under their names, the modules in them.
 macro_rules! task_modules {
-    ($($name:ident,)*) => {
+    ($($name:ident::$module:ident,)*) => {
         $(mod $name;)*
 
         /// All task modules: the name in problem files, and what reads their parameters.
-        pub const REGISTRY: &[(&str, Configure)] = &[$((stringify!($name), $name::configure),)*];
+        pub const REGISTRY: &[(&str, Configure)] =
+            &[$((stringify!($name), configure::<$name::$module>),)*];
     };
 }
 
 task_modules! {
-    chaining,
-    placing,
-    routing,
-    stacking,
+    chaining::Chaining,
+    placing::Placing,
+    routing::Routing,
+    stacking::Stacking,
 }
 
 /// Reads and checks the `parameters` of a module in a problem file.
 pub type Configure = fn(Value) -> Result<Box<dyn TaskModule>, ParameterError>;
+
+/// A module without parameters has its defaults.
+fn configure<M>(parameters: Value) -> Result<Box<dyn TaskModule>, ParameterError>
+where
+    M: TaskModule + Default + DeserializeOwned + 'static,
+{
+    let module = match parameters {
+        Value::Null => M::default(),
+        given => serde_yaml_ng::from_value(given).map_err(|e| ParameterError(e.to_string()))?,
+    };
+    module.check()?;
+    Ok(Box::new(module))
+}
 
 /// Parameters that a module does not take.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
@@ -37,6 +51,9 @@ pub struct ParameterError(pub String);
 
 /// A task module with its parameters: what an episode's task is drawn from.
 pub trait TaskModule: Send + Sync + fmt::Debug {
+    /// Refuses parameters out of range.
+    fn check(&self) -> Result<(), ParameterError>;
+
     /// Edge lengths, along the anchor's x and y, of the rectangle about the anchor that holds all
     /// the module's bodies at the start and in the goal.
     fn footprint_m(&self) -> Vector2<f64>;
@@ -70,7 +87,24 @@ pub trait Task: Send {
 
     /// The next action of a stochastic demonstrator that sees the true state; nothing when there
     /// is nothing left to do.
-    fn demonstrate(&mut self, cell: &Cell, rng: &mut ChaCha8Rng) -> Option<PickPlace>;
+    fn demonstrate(&mut self, cell: &Cell, rng: &mut ChaCha8Rng) -> Option<Move>;
+}
+
+/// A demonstrator's action.
+pub struct Move {
+    /// The action.
+    pub action: PickPlace,
+    /// What it does in the present state, where that was rehearsed.
+    pub rehearsal: Option<Rehearsal>,
+}
+
+impl From<PickPlace> for Move {
+    fn from(action: PickPlace) -> Self {
+        Self {
+            action,
+            rehearsal: None,
+        }
+    }
 }
 
 /// Moves that a demonstrator rehearses at most before it takes the best of them.
@@ -90,10 +124,10 @@ fn rehearsed(
     rng: &mut ChaCha8Rng,
     mut guess: impl FnMut(usize, &mut ChaCha8Rng) -> Option<PickPlace>,
     reached: impl Fn(&World) -> usize,
-) -> Option<PickPlace> {
+) -> Option<Move> {
     let before = reached(cell.world());
     // By rehearsals that went well, and whether anything is gained.
-    let mut best: Option<((usize, bool), PickPlace)> = None;
+    let mut best: Option<((usize, bool), Move)> = None;
     for index in 0..GUESSES {
         let Some(meant) = guess(index, rng) else {
             break;
@@ -104,25 +138,30 @@ fn rehearsed(
         });
         let mut good = 0;
         let mut gains = false;
-        for action in &moves {
-            let after = match cell.rehearse(action, settings) {
-                Ok((Outcome::Placed, world)) => reached(&world),
-                _ => break,
-            };
-            gains = gains || (good == 0 && after > before);
-            if after != before + 1 {
+        let mut first = Move::from(moves[0]);
+        for (index, action) in moves.iter().enumerate() {
+            let rehearsal = cell.rehearse(action, settings).ok();
+            let placed = rehearsal
+                .as_ref()
+                .filter(|rehearsal| rehearsal.outcome() == Outcome::Placed);
+            let after = placed.map(|rehearsal| reached(rehearsal.world()));
+            if index == 0 {
+                gains = after > Some(before);
+                first.rehearsal = rehearsal;
+            }
+            if after != Some(before + 1) {
                 break;
             }
             good += 1;
         }
-        if best.is_none_or(|(most, _)| (good, gains) > most) {
-            best = Some(((good, gains), moves[0]));
+        if best.as_ref().is_none_or(|(most, _)| (good, gains) > *most) {
+            best = Some(((good, gains), first));
         }
         if good == REHEARSALS {
             break;
         }
     }
-    best.map(|(_, action)| action)
+    best.map(|(_, best)| best)
 }
 
 /// A pose with noise.
@@ -132,14 +171,6 @@ fn near(pose: &Isometry2<f64>, rng: &mut ChaCha8Rng) -> Isometry2<f64> {
         pose.translation.vector + Vector2::new(noise(), noise()),
         pose.rotation.angle(),
     )
-}
-
-/// Reads parameters; a module without any may leave them out.
-fn read_parameters<P: DeserializeOwned + Default>(value: Value) -> Result<P, ParameterError> {
-    match value {
-        Value::Null => Ok(P::default()),
-        value => serde_yaml_ng::from_value(value).map_err(|e| ParameterError(e.to_string())),
-    }
 }
 
 /// Refuses a value outside a range.

@@ -7,7 +7,7 @@
 //!
 //! Module frame: x along the table's short side when the anchor's yaw is 0; left is +y.
 
-use super::{ParameterError, Task, TaskModule, at_height, check_range, read_parameters};
+use super::{Move, ParameterError, Task, TaskModule, at_height, check_range};
 use crate::colors;
 use crate::world::{BodyId, Mobility, Part, Shape, World};
 use nalgebra::{Isometry2, Isometry3, Point2, Vector2, Vector3};
@@ -15,8 +15,7 @@ use pick_place::{PickPlace, PrimitiveSettings};
 use rand::RngExt;
 use rand::seq::IndexedRandom;
 use rand_chacha::ChaCha8Rng;
-use serde::{Deserialize, Serialize};
-use serde_yaml_ng::Value;
+use serde::Deserialize;
 use std::f64::consts::TAU;
 
 /// Edge length of the plate, and its height.
@@ -50,10 +49,10 @@ const SETTINGS: PrimitiveSettings = PrimitiveSettings {
     acceleration_m_s2: 4.0,
 };
 
-/// Parameters of the module in a problem file.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+/// The module's parameters in a problem file.
+#[derive(Clone, Copy, Debug, Deserialize)]
 #[serde(deny_unknown_fields, default)]
-struct Parameters {
+pub(super) struct Placing {
     /// How far a disk's centre may be from its cell's, in m.
     tolerance_m: f64,
     /// Size of the even disks: `big`, `small`, or `random`.
@@ -64,7 +63,7 @@ struct Parameters {
     pick_spread: f64,
 }
 
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[derive(Clone, Copy, Debug, Deserialize)]
 #[serde(rename_all = "snake_case")]
 enum Size {
     Random,
@@ -72,7 +71,7 @@ enum Size {
     Small,
 }
 
-impl Default for Parameters {
+impl Default for Placing {
     fn default() -> Self {
         Self {
             tolerance_m: 0.01,
@@ -81,20 +80,6 @@ impl Default for Parameters {
             pick_spread: 0.25,
         }
     }
-}
-
-/// Reads the module's parameters.
-pub(super) fn configure(parameters: Value) -> Result<Box<dyn TaskModule>, ParameterError> {
-    let parameters: Parameters = read_parameters(parameters)?;
-    // Beyond half the pitch a disk would be near two cells.
-    check_range("tolerance_m", parameters.tolerance_m, 1e-3, 0.03)?;
-    check_range("pick_spread", parameters.pick_spread, 0.0, 0.8)?;
-    Ok(Box::new(Placing { parameters }))
-}
-
-#[derive(Debug)]
-struct Placing {
-    parameters: Parameters,
 }
 
 /// A disk, and whether it is an even one.
@@ -116,10 +101,16 @@ struct PlacingTask {
     disks: Vec<Disk>,
     cells: Vec<Cell>,
     yaw_rad: f64,
-    parameters: Parameters,
+    parameters: Placing,
 }
 
 impl TaskModule for Placing {
+    fn check(&self) -> Result<(), ParameterError> {
+        // Beyond half the pitch a disk would be near two cells.
+        check_range("tolerance_m", self.tolerance_m, 1e-3, 0.03)?;
+        check_range("pick_spread", self.pick_spread, 0.0, 0.8)
+    }
+
     fn footprint_m(&self) -> Vector2<f64> {
         Vector2::new(STRIP_LENGTH_M, 2.0 * STRIP_M.1)
     }
@@ -152,8 +143,8 @@ impl Placing {
         });
         let mut disks = Vec::with_capacity(9);
         let parities = [
-            (true, 5, 1.0, self.parameters.even, colors::RED),
-            (false, 4, -1.0, self.parameters.odd, colors::BLUE),
+            (true, 5, 1.0, self.even, colors::RED),
+            (false, 4, -1.0, self.odd, colors::BLUE),
         ];
         for (even, count, side, size, rgb) in parities {
             let big = match size {
@@ -195,7 +186,7 @@ impl Placing {
             disks,
             cells: cells.collect(),
             yaw_rad: anchor.rotation.angle(),
-            parameters: self.parameters,
+            parameters: *self,
         }
     }
 }
@@ -292,7 +283,7 @@ impl Task for PlacingTask {
 
     /// A random disk that is not placed yet and nothing lies on, to a random free cell of its
     /// parity. The disk is gripped near its centre and set down so that its centre meets the cell's.
-    fn demonstrate(&mut self, cell: &crate::Cell, rng: &mut ChaCha8Rng) -> Option<PickPlace> {
+    fn demonstrate(&mut self, cell: &crate::Cell, rng: &mut ChaCha8Rng) -> Option<Move> {
         let world = cell.world();
         let mut moves = Vec::new();
         for disk in &self.disks {
@@ -316,10 +307,11 @@ impl Task for PlacingTask {
         let angle = rng.random_range(0.0..TAU);
         let offset = Vector2::new(angle.cos(), angle.sin()) * radius;
         let center = world.position(disk.body).xy();
-        Some(PickPlace {
+        let action = PickPlace {
             pick: Isometry2::new(center.coords + offset, 0.0),
             place: Isometry2::new(cell.center.coords + offset, 0.0),
-        })
+        };
+        Some(action.into())
     }
 }
 
@@ -337,9 +329,7 @@ mod tests {
 
     fn scene(seed: u64) -> (World, PlacingTask) {
         let mut world = World::new(&away());
-        let placing = Placing {
-            parameters: Parameters::default(),
-        };
+        let placing = Placing::default();
         let anchor = Isometry2::new(Vector2::new(0.5, 0.05), 0.3);
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
         let task = placing.draw(&mut world, &anchor, &mut rng);
@@ -376,10 +366,8 @@ mod tests {
             assert_eq!(task.reached(&world), count + 1);
         }
         let mut rng = ChaCha8Rng::seed_from_u64(0);
-        assert_eq!(
-            task.demonstrate(&crate::Cell::around(&world), &mut rng),
-            None
-        );
+        let next = task.demonstrate(&crate::Cell::around(&world), &mut rng);
+        assert!(next.is_none());
     }
 
     #[test]
@@ -491,7 +479,8 @@ mod tests {
         fn the_demonstrator_brings_a_disk_onto_a_free_cell_of_its_parity(seed in 0u64..1_000_000) {
             let (world, mut task) = scene(seed);
             let mut rng = ChaCha8Rng::seed_from_u64(seed);
-            let action = task.demonstrate(&crate::Cell::around(&world), &mut rng).unwrap();
+            let cell = crate::Cell::around(&world);
+            let action = task.demonstrate(&cell, &mut rng).unwrap().action;
             let pick = Point2::from(action.pick.translation.vector);
             let disk = task.disks.iter().find(|d| {
                 (world.position(d.body).xy() - pick).norm() <= 0.25 * d.radius_m + 1e-9

@@ -8,7 +8,7 @@
 //!
 //! Module frame: the cable runs along +x; the far side is +y, the side on which it starts -y.
 
-use super::{ParameterError, Task, TaskModule, at_height, check_range, read_parameters, rehearsed};
+use super::{Move, ParameterError, Task, TaskModule, at_height, check_range, rehearsed};
 use crate::cell::Cell;
 use crate::colors;
 use crate::world::{BeadChain, BodyId, Mobility, Part, Shape, World};
@@ -16,8 +16,7 @@ use nalgebra::{Isometry2, Isometry3, Point2, Vector2};
 use pick_place::{PickPlace, PrimitiveSettings};
 use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
-use serde::{Deserialize, Serialize};
-use serde_yaml_ng::Value;
+use serde::Deserialize;
 use std::f64::consts::PI;
 
 const PEG_RADIUS_M: f64 = 0.012;
@@ -71,41 +70,23 @@ const DRAW: PrimitiveSettings = PrimitiveSettings {
     ..SETTINGS
 };
 
-/// Parameters of the module in a problem file.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+/// The module's parameters in a problem file.
+#[derive(Clone, Copy, Debug, Deserialize)]
 #[serde(deny_unknown_fields, default)]
-struct Parameters {
+pub(super) struct Routing {
     /// Number of pegs, at least and at most.
     pegs: (usize, usize),
     /// How far a bead may be from where the cable should pass a peg, and the end from its goal.
     tolerance_m: f64,
 }
 
-impl Default for Parameters {
+impl Default for Routing {
     fn default() -> Self {
         Self {
             pegs: (2, 3),
             tolerance_m: 0.02,
         }
     }
-}
-
-/// Reads the module's parameters.
-pub(super) fn configure(parameters: Value) -> Result<Box<dyn TaskModule>, ParameterError> {
-    let parameters: Parameters = read_parameters(parameters)?;
-    check_range("tolerance_m", parameters.tolerance_m, 5e-3, 0.03)?;
-    let (least, most) = parameters.pegs;
-    if !(2..=3).contains(&least) || !(least..=3).contains(&most) {
-        return Err(ParameterError(format!(
-            "pegs is [{least}, {most}], expected two numbers in order, of 2 and 3"
-        )));
-    }
-    Ok(Box::new(Routing { parameters }))
-}
-
-#[derive(Debug)]
-struct Routing {
-    parameters: Parameters,
 }
 
 /// A peg in the module frame, and the side on which the cable has to pass it.
@@ -132,10 +113,21 @@ struct RoutingTask {
     /// Whether what comes next is drawn along the table, when last looked at: the cable round a peg
     /// that it passes on the right side, or its end to the goal.
     draws: bool,
-    parameters: Parameters,
+    parameters: Routing,
 }
 
 impl TaskModule for Routing {
+    fn check(&self) -> Result<(), ParameterError> {
+        check_range("tolerance_m", self.tolerance_m, 5e-3, 0.03)?;
+        let (least, most) = self.pegs;
+        if !(2..=3).contains(&least) || !(least..=3).contains(&most) {
+            return Err(ParameterError(format!(
+                "pegs is [{least}, {most}], expected two numbers in order, of 2 and 3"
+            )));
+        }
+        Ok(())
+    }
+
     fn footprint_m(&self) -> Vector2<f64> {
         Vector2::new(FOOTPRINT_M.0, FOOTPRINT_M.1)
     }
@@ -157,7 +149,7 @@ impl Routing {
         anchor: &Isometry2<f64>,
         rng: &mut ChaCha8Rng,
     ) -> RoutingTask {
-        let (least, most) = self.parameters.pegs;
+        let (least, most) = self.pegs;
         let count = rng.random_range(least..=most);
         let spacing = if count == 2 { 0.15 } else { 0.105 };
         let pegs: Vec<_> = (0..count)
@@ -214,7 +206,7 @@ impl Routing {
             cable,
             end,
             draws: false,
-            parameters: self.parameters,
+            parameters: *self,
         }
     }
 }
@@ -411,7 +403,7 @@ impl Task for RoutingTask {
     /// Lifts the bead that belongs against the next peg over to its side of the peg, or draws the
     /// cable round a peg that it passes already; when all pegs are done, draws the end to its goal.
     /// Of a few such moves it takes the first that succeeds in rehearsals.
-    fn demonstrate(&mut self, cell: &Cell, rng: &mut ChaCha8Rng) -> Option<PickPlace> {
+    fn demonstrate(&mut self, cell: &Cell, rng: &mut ChaCha8Rng) -> Option<Move> {
         let beads = self.beads(cell.world());
         if self.count(&beads) == self.goal_count() {
             return None;
@@ -449,10 +441,8 @@ mod tests {
     fn scene(seed: u64, pegs: usize) -> (World, RoutingTask) {
         let mut world = World::new(&away());
         let routing = Routing {
-            parameters: Parameters {
-                pegs: (pegs, pegs),
-                ..Parameters::default()
-            },
+            pegs: (pegs, pegs),
+            ..Routing::default()
         };
         let anchor = Isometry2::new(Vector2::new(0.5, -0.3), 0.2);
         let mut rng = ChaCha8Rng::seed_from_u64(seed);

@@ -7,7 +7,7 @@
 //!
 //! Module frame: the stand is at -x, the array at +x.
 
-use super::{ParameterError, Task, TaskModule, at_height, check_range, read_parameters};
+use super::{Move, ParameterError, Task, TaskModule, at_height, check_range};
 use crate::cell::Cell;
 use crate::colors;
 use crate::world::{BodyId, Mobility, Part, Shape, World};
@@ -16,8 +16,7 @@ use pick_place::{PickPlace, PrimitiveSettings};
 use rand::RngExt;
 use rand::seq::{IndexedRandom, SliceRandom};
 use rand_chacha::ChaCha8Rng;
-use serde::{Deserialize, Serialize};
-use serde_yaml_ng::Value;
+use serde::Deserialize;
 use std::f64::consts::{FRAC_PI_2, FRAC_PI_4, TAU};
 
 /// Edge length of a block.
@@ -65,10 +64,10 @@ const SETTINGS: PrimitiveSettings = PrimitiveSettings {
     acceleration_m_s2: 4.0,
 };
 
-/// Parameters of the module in a problem file.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+/// The module's parameters in a problem file.
+#[derive(Clone, Copy, Debug, Deserialize)]
 #[serde(deny_unknown_fields, default)]
-struct Parameters {
+pub(super) struct Stacking {
     /// How far a block's centre may be from its goal's in the plane, in m.
     tolerance_m: f64,
     /// How far its yaw may be from the stand's, modulo a quarter turn, in rad.
@@ -79,7 +78,7 @@ struct Parameters {
     pick_spread_m: f64,
 }
 
-impl Default for Parameters {
+impl Default for Stacking {
     fn default() -> Self {
         Self {
             tolerance_m: 0.01,
@@ -88,31 +87,6 @@ impl Default for Parameters {
             pick_spread_m: 0.004,
         }
     }
-}
-
-/// Reads the module's parameters.
-pub(super) fn configure(parameters: Value) -> Result<Box<dyn TaskModule>, ParameterError> {
-    let parameters: Parameters = read_parameters(parameters)?;
-    check_range("tolerance_m", parameters.tolerance_m, 1e-3, PITCH_M / 4.0)?;
-    check_range(
-        "yaw_tolerance_rad",
-        parameters.yaw_tolerance_rad,
-        0.01,
-        FRAC_PI_4,
-    )?;
-    check_range("shift_m", parameters.shift_m, 0.0, MAX_SHIFT_M)?;
-    check_range(
-        "pick_spread_m",
-        parameters.pick_spread_m,
-        0.0,
-        BLOCK_M / 4.0,
-    )?;
-    Ok(Box::new(Stacking { parameters }))
-}
-
-#[derive(Debug)]
-struct Stacking {
-    parameters: Parameters,
 }
 
 /// A goal, and the block of the colour that it wants.
@@ -127,10 +101,18 @@ struct StackingTask {
     goals: Vec<Goal>,
     /// Pose of the stand.
     stand: Isometry2<f64>,
-    parameters: Parameters,
+    parameters: Stacking,
 }
 
 impl TaskModule for Stacking {
+    fn check(&self) -> Result<(), ParameterError> {
+        check_range("tolerance_m", self.tolerance_m, 1e-3, PITCH_M / 4.0)?;
+        check_range("yaw_tolerance_rad", self.yaw_tolerance_rad, 0.01, FRAC_PI_4)?;
+        check_range("shift_m", self.shift_m, 0.0, MAX_SHIFT_M)?;
+        check_range("pick_spread_m", self.pick_spread_m, 0.0, BLOCK_M / 4.0)?;
+        Ok(())
+    }
+
     fn footprint_m(&self) -> Vector2<f64> {
         Vector2::new(FOOTPRINT_M.0, FOOTPRINT_M.1)
     }
@@ -152,7 +134,7 @@ impl Stacking {
         anchor: &Isometry2<f64>,
         rng: &mut ChaCha8Rng,
     ) -> StackingTask {
-        let shift = self.parameters.shift_m;
+        let shift = self.shift_m;
         let mut near = |(x, y): (f64, f64)| {
             let mut off = || rng.random_range(-shift..=shift);
             Vector2::new(x + off(), y + off())
@@ -206,7 +188,7 @@ impl Stacking {
         StackingTask {
             goals: goals.collect(),
             stand,
-            parameters: self.parameters,
+            parameters: *self,
         }
     }
 }
@@ -290,7 +272,7 @@ impl Task for StackingTask {
 
     /// A random block of the lowest row that is not complete, to its goal: gripped near the centre
     /// of its top, and turned no further than it takes.
-    fn demonstrate(&mut self, cell: &Cell, rng: &mut ChaCha8Rng) -> Option<PickPlace> {
+    fn demonstrate(&mut self, cell: &Cell, rng: &mut ChaCha8Rng) -> Option<Move> {
         let world = cell.world();
         let row = self.row(world)?.iter().filter(|goal| {
             let block = world.position(goal.block);
@@ -307,10 +289,11 @@ impl Task for StackingTask {
         let offset = Vector2::new(angle.cos(), angle.sin()) * radius;
         let turn = UnitComplex::new(self.turn_rad(goal.block, world));
         let center = world.position(goal.block).xy();
-        Some(PickPlace {
+        let action = PickPlace {
             pick: Isometry2::new(center.coords + offset, 0.0),
             place: Isometry2::new(goal.center.xy().coords + turn * offset, turn.angle()),
-        })
+        };
+        Some(action.into())
     }
 }
 
@@ -332,9 +315,7 @@ mod tests {
 
     fn scene(seed: u64) -> (World, StackingTask) {
         let mut world = World::new(&away());
-        let stacking = Stacking {
-            parameters: Parameters::default(),
-        };
+        let stacking = Stacking::default();
         let mut rng = ChaCha8Rng::seed_from_u64(seed);
         let task = stacking.draw(&mut world, &anchor(), &mut rng);
         (world, task)
@@ -373,7 +354,8 @@ mod tests {
             assert_eq!(task.reached(&world), goal + 1);
         }
         let mut rng = ChaCha8Rng::seed_from_u64(0);
-        assert_eq!(task.demonstrate(&Cell::around(&world), &mut rng), None);
+        let next = task.demonstrate(&Cell::around(&world), &mut rng);
+        assert!(next.is_none());
     }
 
     #[test]
@@ -397,7 +379,8 @@ mod tests {
         assert_eq!(task.reached(&world), 2);
         // Nor is there a way to go on but to take the tower down.
         let mut rng = ChaCha8Rng::seed_from_u64(0);
-        assert_eq!(task.demonstrate(&Cell::around(&world), &mut rng), None);
+        let next = task.demonstrate(&Cell::around(&world), &mut rng);
+        assert!(next.is_none());
         // Floating where it should be, with nothing below.
         let (mut world, mut task) = scene(4);
         put(&mut world, &task, 5, 5, EXACT);
@@ -437,6 +420,27 @@ mod tests {
         tilted.rotation *= nalgebra::UnitQuaternion::from_euler_angles(FRAC_PI_2 - 0.15, 0.0, 0.0);
         world.place(task.goals[0].block, &tilted);
         assert_eq!(task.reached(&world), 1);
+    }
+
+    #[test]
+    fn a_block_on_its_edge_earns_nothing() {
+        let (mut world, mut task) = scene(3);
+        for goal in [0, 2] {
+            put(&mut world, &task, goal, goal, EXACT);
+        }
+        // Between its neighbours there is room for it on its edge: it leans on one of them.
+        let goal = task.goals[1];
+        let up_m = BLOCK_M * (0.5f64.sqrt() - 0.5) + 1e-3;
+        let mut pose = at_height(&task.stand, goal.center.z + up_m);
+        pose.rotation *= nalgebra::UnitQuaternion::from_euler_angles(FRAC_PI_4, 0.0, 0.0);
+        world.place(goal.block, &pose);
+        rest(&mut world);
+        let rests = world.pose(goal.block);
+        let tilt_rad = (rests.rotation * Vector3::z()).angle(&Vector3::z());
+        assert!((FRAC_PI_4 - tilt_rad).abs() < 0.3, "it fell: {tilt_rad}");
+        let off = (rests.translation.vector - goal.center.coords).xy();
+        assert!(off.norm() < task.parameters.tolerance_m, "{off}");
+        assert_eq!(task.reached(&world), 2);
     }
 
     #[test]
@@ -489,7 +493,8 @@ mod tests {
         fn the_demonstrator_turns_a_block_of_the_lowest_row_square_to_the_stand(seed in 0u64..1_000_000) {
             let (mut world, mut task) = scene(seed);
             let mut rng = ChaCha8Rng::seed_from_u64(seed);
-            let action = task.demonstrate(&Cell::around(&world), &mut rng).unwrap();
+            let cell = Cell::around(&world);
+            let action = task.demonstrate(&cell, &mut rng).unwrap().action;
             let turn = action.place.rotation.angle();
             prop_assert!(turn.abs() < FRAC_PI_4 + 0.01);
             let goal = task.goals[..3].iter().find(|goal| {

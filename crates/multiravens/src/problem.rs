@@ -107,17 +107,22 @@ impl Problem {
             let placement = entry.place().map_err(|e| format!("modules[{index}].{e}"))?;
             let area = placement.area();
             let workspace = Workspace::RAVENS;
-            if let Some(out) = area.iter().find(|p| workspace.pixel(p).is_none()) {
+            if area.iter().any(|p| workspace.pixel(p).is_none()) {
                 return Err(format!(
-                    "modules[{index}] ({}): reaches out of the workspace at x {:.3}, y {:.3}",
-                    placement.name, out.x, out.y
+                    "modules[{index}] ({}): takes {}, expected within the workspace, {}",
+                    placement.name,
+                    extent(&area),
+                    extent(&corners(&workspace))
                 ));
             }
             for (earlier, other) in modules.iter().enumerate() {
                 if overlap(&area, &other.area()) {
                     return Err(format!(
-                        "modules[{index}] ({}): overlaps modules[{earlier}] ({})",
-                        placement.name, other.name
+                        "modules[{index}] ({}): takes {}, which overlaps modules[{earlier}] ({}), {}",
+                        placement.name,
+                        extent(&area),
+                        other.name,
+                        extent(&other.area())
                     ));
                 }
             }
@@ -172,6 +177,28 @@ impl Placement {
     }
 }
 
+fn corners(workspace: &Workspace) -> [Point2<f64>; 4] {
+    let size = Vector2::new(workspace.cols as f64, workspace.rows as f64) * workspace.pixel_size_m;
+    let (from, to) = (workspace.origin_m, workspace.origin_m + size);
+    [
+        (from.x, from.y),
+        (to.x, from.y),
+        (to.x, to.y),
+        (from.x, to.y),
+    ]
+    .map(|(x, y)| Point2::new(x, y))
+}
+
+/// For people: how far a rectangle goes along x and y.
+fn extent(area: &[Point2<f64>; 4]) -> String {
+    let low = area.iter().fold(area[0], |low, p| low.inf(p));
+    let high = area.iter().fold(area[0], |high, p| high.sup(p));
+    format!(
+        "x {:.3} to {:.3}, y {:.3} to {:.3} m",
+        low.x, high.x, low.y, high.y
+    )
+}
+
 /// Whether two rectangles overlap: no edge of either separates them.
 fn overlap(a: &[Point2<f64>; 4], b: &[Point2<f64>; 4]) -> bool {
     // Neighbours may touch; rounding must not make that an overlap.
@@ -213,6 +240,9 @@ mod tests {
             e.contains("modules[0].parameters") && e.contains("tolerance"),
             "{e}"
         );
+        let e =
+            error("modules: [{name: routing, anchor: {x_m: 0.5, y_m: 0}, parameters: {pegs: 3}}]");
+        assert!(e.contains("parameters: pegs: "), "{e}");
         let e = error(
             "modules: [{name: placing, anchor: {x_m: 0.5, y_m: 0}, parameters: {tolerance_m: 0.5}}]",
         );
@@ -222,14 +252,23 @@ mod tests {
     #[test]
     fn modules_stay_on_the_table_and_off_each_other() {
         let e = error("modules: [{name: placing, anchor: {x_m: 0.3, y_m: 0}}]");
-        assert!(e.contains("workspace"), "{e}");
+        assert!(
+            e.contains("takes x 0.090 to 0.510, y -0.200 to 0.200 m")
+                && e.contains("workspace, x 0.250 to 0.750, y -0.500 to 0.500 m"),
+            "{e}"
+        );
         let two = |y: f64| {
             format!(
                 "modules: [{{name: placing, anchor: {{x_m: 0.5, y_m: 0}}}},
                            {{name: placing, anchor: {{x_m: 0.5, y_m: {y}, yaw_rad: 0.1}}}}]"
             )
         };
-        assert!(error(&two(0.2)).contains("overlaps modules[0]"));
+        let e = error(&two(0.2));
+        assert!(
+            e.contains("modules[1] (placing): takes")
+                && e.contains("overlaps modules[0] (placing), x 0.290 to 0.710"),
+            "{e}"
+        );
     }
 
     #[test]

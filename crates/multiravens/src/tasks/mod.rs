@@ -38,7 +38,9 @@ where
 {
     let module = match parameters {
         Value::Null => M::default(),
-        given => serde_yaml_ng::from_value(given).map_err(|e| ParameterError(e.to_string()))?,
+        given => {
+            serde_path_to_error::deserialize(given).map_err(|e| ParameterError(e.to_string()))?
+        }
     };
     module.check()?;
     Ok(Box::new(module))

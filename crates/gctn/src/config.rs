@@ -210,13 +210,7 @@ impl NetworkConfig {
 
     /// Refuses sizes that no network can be made of.
     pub fn check(&self) -> Result<(), Error> {
-        let size = |size: usize| (16..=4096).contains(&size) && size.is_multiple_of(16);
-        let a_size = "a multiple of 16 from 16 to 4096";
-        check("rows", size(self.rows), self.rows, a_size)?;
-        check("cols", size(self.cols), self.cols, a_size)?;
-        let pixel_size_m = self.pixel_size_m;
-        let good = pixel_size_m.is_finite() && pixel_size_m > 0.0;
-        check("pixel_size_m", good, pixel_size_m, "a positive number")?;
+        check_size([self.rows, self.cols], self.pixel_size_m)?;
         let good = (1..=360).contains(&self.rotations);
         check("rotations", good, self.rotations, "1 to 360")?;
         let channels = |channels: &usize| (1..=1024).contains(channels);
@@ -269,24 +263,36 @@ impl NetworkConfig {
 
     /// Refuses heightmaps of another grid: the network has learned this one.
     pub fn check_workspace(&self, workspace: &Workspace) -> Result<(), Error> {
-        let Self {
-            rows,
-            cols,
-            pixel_size_m,
-            ..
-        } = *self;
-        let same_pixel = (workspace.pixel_size_m - pixel_size_m).abs() < 1e-9;
-        if (workspace.rows, workspace.cols) == (rows, cols) && same_pixel {
-            return Ok(());
-        }
-        Err(Error::Workspace {
-            actual: format!(
-                "{}x{} cells of {} m",
-                workspace.rows, workspace.cols, workspace.pixel_size_m
-            ),
-            expected: format!("{rows}x{cols} cells of {pixel_size_m} m"),
-        })
+        check_grid([self.rows, self.cols], self.pixel_size_m, workspace)
     }
+}
+
+fn check_grid(
+    [rows, cols]: [usize; 2],
+    pixel_size_m: f64,
+    workspace: &Workspace,
+) -> Result<(), Error> {
+    let same_pixel = (workspace.pixel_size_m - pixel_size_m).abs() < 1e-9;
+    if (workspace.rows, workspace.cols) == (rows, cols) && same_pixel {
+        return Ok(());
+    }
+    Err(Error::Workspace {
+        actual: format!(
+            "{}x{} cells of {} m",
+            workspace.rows, workspace.cols, workspace.pixel_size_m
+        ),
+        expected: format!("{rows}x{cols} cells of {pixel_size_m} m"),
+    })
+}
+
+/// Refuses a grid that no network can be made for.
+fn check_size([rows, cols]: [usize; 2], pixel_size_m: f64) -> Result<(), Error> {
+    let size = |size: usize| (16..=4096).contains(&size) && size.is_multiple_of(16);
+    let a_size = "a multiple of 16 from 16 to 4096";
+    check("rows", size(rows), rows, a_size)?;
+    check("cols", size(cols), cols, a_size)?;
+    let good = pixel_size_m.is_finite() && pixel_size_m > 0.0;
+    check("pixel_size_m", good, pixel_size_m, "a positive number")
 }
 
 /// How a network is trained.
@@ -473,5 +479,123 @@ impl TrainingConfig {
         check("hue_probability", good, probability, "0 to 1")?;
         let good = (1..=1024).contains(&self.threads);
         check("threads", good, self.threads, "1 to 1024")
+    }
+}
+
+/// A network that embeds heightmaps, and the grid it works on.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct EmbeddingConfig {
+    /// Rows of the heightmaps (along +y).
+    pub rows: usize,
+    /// Columns of the heightmaps (along +x).
+    pub cols: usize,
+    /// Edge length of a cell of the heightmaps.
+    pub pixel_size_m: f64,
+    /// Channels at strides 2, 4, 8 and 16, one residual block each.
+    pub channels: [usize; 4],
+    /// Numbers for each cell of stride 16.
+    pub features: usize,
+}
+
+impl Default for EmbeddingConfig {
+    fn default() -> Self {
+        Self {
+            rows: rows(),
+            cols: cols(),
+            pixel_size_m: pixel_size_m(),
+            channels: [16, 32, 64, 64],
+            features: 8,
+        }
+    }
+}
+
+impl EmbeddingConfig {
+    /// Refuses sizes that no network can be made of.
+    pub fn check(&self) -> Result<(), Error> {
+        check_size([self.rows, self.cols], self.pixel_size_m)?;
+        let number = |number: &usize| (1..=1024).contains(number);
+        let good = self.channels.iter().all(number);
+        let actual = format!("{:?}", self.channels);
+        check("channels", good, actual, "1 to 1024 each")?;
+        let good = number(&self.features);
+        check("features", good, self.features, "1 to 1024")
+    }
+
+    /// Refuses heightmaps of another grid: the network has learned this one.
+    pub fn check_workspace(&self, workspace: &Workspace) -> Result<(), Error> {
+        check_grid([self.rows, self.cols], self.pixel_size_m, workspace)
+    }
+}
+
+/// How an embedding is trained.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct EmbeddingTraining {
+    /// Seed of weights and of all that is drawn.
+    pub seed: u64,
+    /// Gradient steps in all; the learning rate ends there, at 0.
+    pub steps: u64,
+    /// Demonstrations a gradient step.
+    pub batch: usize,
+    /// Largest learning rate.
+    pub learning_rate: f64,
+    /// Steps over which the learning rate rises linearly from 0.
+    pub warm_up_steps: u64,
+    /// The same for all images of a demonstration.
+    pub augmentation: Augmentation,
+    /// Standard deviation of the smooth displacement of an image against its other view [cells].
+    pub displacement_sigma_px: f64,
+    /// Edge of the cells within which that displacement is smooth [cells].
+    pub displacement_spacing_px: usize,
+    /// Largest error of a colour of the other view, of 255.
+    pub color_noise: f64,
+    /// Largest error of a height of the other view [m].
+    pub height_noise_m: f64,
+    /// Threads of libtorch. Sums are split by thread: another number gives other last bits.
+    pub threads: usize,
+}
+
+impl Default for EmbeddingTraining {
+    fn default() -> Self {
+        Self {
+            seed: 0,
+            steps: 400,
+            batch: 2,
+            learning_rate: 1e-3,
+            warm_up_steps: 20,
+            augmentation: Augmentation::default(),
+            displacement_sigma_px: 3.0,
+            displacement_spacing_px: 32,
+            color_noise: 12.0,
+            height_noise_m: 0.003,
+            threads: 1,
+        }
+    }
+}
+
+impl EmbeddingTraining {
+    /// Refuses values that cannot train.
+    pub fn check(&self) -> Result<(), Error> {
+        let like = TrainingConfig {
+            steps: self.steps,
+            batch: self.batch,
+            learning_rate: self.learning_rate,
+            augmentation: self.augmentation.clone(),
+            threads: self.threads,
+            ..TrainingConfig::compact()
+        };
+        like.check()?;
+        for (what, value) in [
+            ("displacement_sigma_px", self.displacement_sigma_px),
+            ("color_noise", self.color_noise),
+            ("height_noise_m", self.height_noise_m),
+        ] {
+            let good = value.is_finite() && value >= 0.0;
+            check(what, good, value, "0 or a positive number")?;
+        }
+        let spacing = self.displacement_spacing_px;
+        let good = (2..=4096).contains(&spacing);
+        check("displacement_spacing_px", good, spacing, "2 to 4096")
     }
 }

@@ -67,6 +67,14 @@ pub enum Error {
         /// Samples configured.
         expected: usize,
     },
+    /// A demonstration with too few images to tell one from the other.
+    #[error("demonstration {index} has {actual} images, expected at least 2")]
+    Sequence {
+        /// Index of the demonstration in the batch.
+        index: usize,
+        /// Images given.
+        actual: usize,
+    },
     /// The network answered with a number that is none, or training diverged.
     #[error("{what} is not finite{}", step.map(|step| format!(" at step {step}")).unwrap_or_default())]
     NotFinite {

@@ -146,6 +146,16 @@ pub(crate) fn encode(
     }
 }
 
+/// The same of an observation alone: of an encoding without goals.
+pub(crate) fn encode_alone(
+    encoding: Encoding,
+    observation: &Heightmap,
+    warp: &Warp,
+    out: &mut [f32],
+) {
+    encode_goals(encoding, &Image::new(observation), [], warp, out);
+}
+
 fn encode_goals<const GOALS: usize>(
     encoding: Encoding,
     observation: &Image<'_>,
@@ -197,8 +207,8 @@ fn encode_as<const GOALS: usize>(
 }
 
 /// Makes a tensor N x channels x rows x cols, channels last in memory, of encoded images.
-pub(crate) fn tensor(encoding: Encoding, config: &NetworkConfig, encoded: &[f32]) -> Tensor {
-    let (rows, cols) = (config.rows as i64, config.cols as i64);
+pub(crate) fn tensor(encoding: Encoding, [rows, cols]: [usize; 2], encoded: &[f32]) -> Tensor {
+    let (rows, cols) = (rows as i64, cols as i64);
     Tensor::from_slice(encoded)
         .view([-1, rows, cols, encoding.channels() as i64])
         .permute([0, 3, 1, 2])
@@ -226,6 +236,11 @@ pub(crate) fn check_heightmap(
     heightmap: &Heightmap,
 ) -> Result<(), Error> {
     config.check_workspace(&heightmap.workspace)?;
+    check_cells(what, heightmap)
+}
+
+/// Refuses a heightmap that does not fit itself, or is not finite.
+pub(crate) fn check_cells(what: &'static str, heightmap: &Heightmap) -> Result<(), Error> {
     let cells = heightmap.workspace.len();
     for (buffer, actual, expected) in [
         ("rgb", heightmap.rgb.len(), 3 * cells),

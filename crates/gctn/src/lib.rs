@@ -8,19 +8,23 @@ mod checkpoint;
 mod config;
 mod correlation;
 mod device;
+mod embedding;
 mod error;
 mod input;
 mod losses;
 mod network;
+mod optimiser;
 mod policy;
 mod sample;
 mod trainer;
 
 pub use checkpoint::{ModelCard, Storage};
 pub use config::{
-    Augmentation, Compact, Device, GoalConditioning, GrConvnet, Interpolation, Network,
-    NetworkConfig, PlaceLoss, Precision, Resnet43, Schedule, TrainingConfig,
+    Augmentation, Compact, Device, EmbeddingConfig, EmbeddingTraining, GoalConditioning, GrConvnet,
+    Interpolation, Network, NetworkConfig, PlaceLoss, Precision, Resnet43, Schedule,
+    TrainingConfig,
 };
+pub use embedding::{Embedded, Embedding, EmbeddingLoss, EmbeddingTrainer};
 pub use error::Error;
 pub use policy::{Decision, Policy, ScoreMap};
 pub use sample::{Goal, Sample};

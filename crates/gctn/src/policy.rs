@@ -111,7 +111,8 @@ impl Policy {
             let encoding = self.model.encoding();
             let mut encoded = vec![0.0; encoding.channels() * workspace.len()];
             encode(encoding, observation, goal, &Warp::identity(), &mut encoded);
-            let input = tensor(encoding, config, &encoded).to_device(self.device);
+            let input =
+                tensor(encoding, [config.rows, config.cols], &encoded).to_device(self.device);
             let features = self.model.forward(&input);
 
             let (pick_px, pick_score, pick_map) = self.pick(&features.pick, &exclude_px)?;

@@ -9,7 +9,8 @@ use crate::checkpoint::{self, File};
 use crate::input::{Label, encode, tensor};
 use crate::losses::{pick_loss, place_loss};
 use crate::network::{Builder, Model};
-use crate::{Error, ModelCard, NetworkConfig, Policy, Sample, Schedule, Storage, TrainingConfig};
+use crate::optimiser::{self, AdamW, Rate};
+use crate::{Error, ModelCard, NetworkConfig, Policy, Sample, Storage, TrainingConfig};
 
 /// A network in training, its optimiser (AdamW) and its random state.
 #[derive(Debug)]
@@ -18,8 +19,7 @@ pub struct Trainer {
     device: tch::Device,
     model: Model,
     weights: Vec<Tensor>,
-    /// Running mean of the gradient, and of its square, over the flat weights.
-    moments: [Tensor; 2],
+    optimiser: AdamW,
     step: u64,
 }
 
@@ -34,8 +34,6 @@ pub struct Losses {
     pub gradient_norm: f64,
 }
 
-const BETAS: [f64; 2] = [0.9, 0.999];
-const EPSILON: f64 = 1e-8;
 const FORMAT: &str = "gctn-training";
 const VERSION: &str = "1";
 
@@ -52,13 +50,13 @@ impl Trainer {
             training.precision,
         );
         let weights = model.parameters.require_gradients();
-        let moments = [(); 2].map(|()| model.parameters.flat.zeros_like());
+        let optimiser = AdamW::new(&model.parameters.flat);
         Ok(Self {
             config: training.clone(),
             device,
             model,
             weights,
-            moments,
+            optimiser,
             step: 0,
         })
     }
@@ -92,16 +90,7 @@ impl Trainer {
             steps,
             ..
         } = self.config;
-        let warm_up = ((self.step + 1) as f64 / (warm_up_steps + 1) as f64).min(1.0);
-        let factor = match schedule {
-            Schedule::Constant => 1.0,
-            Schedule::Cosine => {
-                let after = self.step.saturating_sub(warm_up_steps) as f64;
-                let span = steps.saturating_sub(warm_up_steps).max(1) as f64;
-                0.5 + 0.5 * (std::f64::consts::PI * (after / span).min(1.0)).cos()
-            }
-        };
-        learning_rate * warm_up * factor
+        optimiser::learning_rate(learning_rate, schedule, warm_up_steps, steps, self.step)
     }
 
     /// One gradient step on a batch of the configured size. Fails, leaving the weights as they were, when
@@ -138,7 +127,14 @@ impl Trainer {
                 return Err(Error::NotFinite { what, step });
             }
         }
-        self.update(gradient, losses.gradient_norm);
+        let rate = Rate {
+            learning_rate: self.learning_rate(),
+            clip: self.config.gradient_clip,
+            weight_decay: self.config.weight_decay,
+        };
+        let (flat, norm) = (&self.model.parameters.flat, losses.gradient_norm);
+        let count = self.step as i32 + 1;
+        self.optimiser.update(flat, gradient, norm, count, rate);
         self.step += 1;
         Ok(losses)
     }
@@ -190,7 +186,7 @@ impl Trainer {
             encode(encoding, sample.observation, sample.goal, &warp, image);
             labels.push(label.warped(&warp));
         }
-        let input = tensor(encoding, network, &encoded).to_device(self.device);
+        let input = tensor(encoding, [network.rows, network.cols], &encoded).to_device(self.device);
         let features = self.model.forward(&input);
         let (grid, sigma) = (&self.model.grid, self.config.label_sigma_cells);
         let pick = pick_loss(grid, sigma, &features, &labels);
@@ -205,27 +201,6 @@ impl Trainer {
             rng,
         );
         Ok([pick, place])
-    }
-
-    /// AdamW (Loshchilov and Hutter, 2019) on the flat weights.
-    fn update(&mut self, mut gradient: Tensor, norm: f64) {
-        let rate = self.learning_rate();
-        let count = self.step as i32 + 1;
-        tch::no_grad(|| {
-            if let Some(clip) = self.config.gradient_clip.filter(|clip| norm > *clip) {
-                gradient *= clip / norm;
-            }
-            let [mean, square] = &mut self.moments;
-            *mean *= BETAS[0];
-            *mean += &gradient * (1.0 - BETAS[0]);
-            *square *= BETAS[1];
-            *square += gradient.square_() * (1.0 - BETAS[1]);
-            let [mean_bias, square_bias] = BETAS.map(|beta| 1.0 - beta.powi(count));
-            let divisor = (&*square / square_bias).sqrt_() + EPSILON;
-            let weights = &mut self.model.parameters.flat;
-            *weights *= 1.0 - rate * self.config.weight_decay;
-            *weights -= (&*mean / divisor) * (rate / mean_bias);
-        });
     }
 
     /// A policy with a copy of the present weights.
@@ -254,15 +229,11 @@ impl Trainer {
 
     /// The flat tensors of a saved state, by name.
     fn state(&self) -> Vec<(String, Tensor)> {
-        let [mean, square] = &self.moments;
-        let flats = [
-            ("weights", &self.model.parameters.flat),
-            ("mean", mean),
-            ("square", square),
-        ];
-        flats
+        let weights = ("weights", &self.model.parameters.flat);
+        std::iter::once(weights)
+            .chain(self.optimiser.entries())
             .map(|(name, tensor)| (name.to_owned(), tensor.shallow_clone()))
-            .into()
+            .collect()
     }
 
     /// Writes all that is needed to go on: weights, optimiser, random state. The file appears whole or

@@ -118,6 +118,21 @@ pub fn side_by_side(pictures: &[RgbImage]) -> RgbImage {
     all
 }
 
+/// Pictures below each other, on a dark ground.
+pub fn stacked(pictures: &[RgbImage]) -> RgbImage {
+    let turned: Vec<_> = pictures
+        .iter()
+        .map(image::imageops::rotate90)
+        .rev()
+        .collect();
+    image::imageops::rotate270(&side_by_side(&turned))
+}
+
+/// Half as wide and high.
+pub fn halved(picture: &RgbImage) -> RgbImage {
+    image::imageops::thumbnail(picture, picture.width() / 2, picture.height() / 2)
+}
+
 /// An image of a camera: row-major, three bytes a pixel.
 pub fn camera(width: usize, height: usize, rgb: &[u8]) -> RgbImage {
     RgbImage::from_fn(width as u32, height as u32, |u, v| {

@@ -1,8 +1,10 @@
 //! Demonstrations as training samples.
 
+use crate::goal::known_images;
 use crate::sampling::{Sampling, SamplingError};
 use bags::{Demonstration, DemonstrationError};
 use gctn::{Goal, GoalConditioning, Sample};
+use heightmap::Heightmap;
 use rand::{Rng, RngExt};
 use std::path::{Path, PathBuf};
 
@@ -194,6 +196,15 @@ impl DataSet {
             .sum()
     }
 
+    /// What a goal module compares with, of a demonstration drawn uniformly: its first image and those after its rewards.
+    pub fn draw_images<R: Rng>(&self, rng: &mut R) -> Result<Vec<&Heightmap>, DataSetError> {
+        if self.is_empty() {
+            return Err(SamplingError::Empty.into());
+        }
+        let indexed = &self.demonstrations[rng.random_range(0..self.demonstrations.len())];
+        Ok(known_images(&indexed.demonstration))
+    }
+
     /// Draws a sample: a demonstration uniformly, then a step by its weights (paper, section IV-B). With
     /// probability `goal_jitter` its goal is the one after the next.
     pub fn draw<R: Rng>(
@@ -238,7 +249,7 @@ impl DataSet {
 mod tests {
     use super::*;
     use bags::DemonstrationStep;
-    use heightmap::{Heightmap, Workspace};
+    use heightmap::Workspace;
     use nalgebra::Isometry2;
     use pick_place::{Outcome, PickPlace, PrimitiveSettings};
     use rand::SeedableRng;

@@ -3,6 +3,7 @@
 use crate::goal::{NextStepOracle, goal};
 use crate::interval::wilson_95;
 use crate::rollout::{Rollout, demonstrate, roll_out};
+use bags::Demonstration;
 use gctn::{GoalConditioning, Policy};
 use multiravens::{Environment, EnvironmentError, Problem};
 use pick_place::PickPlace;
@@ -105,6 +106,8 @@ impl From<gctn::Error> for StepError {
 /// What a policy did in one episode.
 #[derive(Clone, Debug)]
 pub struct Attempt {
+    /// The demonstration of the same start, whose images were the goals.
+    pub shown: Demonstration,
     /// What was seen and done.
     pub rollout: Rollout,
     /// Steps before which the goal module *image distance* would have named the same goal as the oracle.
@@ -152,29 +155,27 @@ pub fn attempt(
             oracle.set(told);
         },
     );
-    let attempt = |rollout| Attempt {
-        rollout,
-        image_distance_right,
-    };
-    rollout.map(attempt).map(Some).map_err(|error| match error {
-        StepError::Environment(source) => EvaluationError::Environment {
-            seed,
-            source: Box::new(source),
-        },
-        StepError::Policy(source) => EvaluationError::Policy { seed, source },
-    })
+    match rollout {
+        Ok(rollout) => Ok(Some(Attempt {
+            shown: shown.demonstration,
+            rollout,
+            image_distance_right,
+        })),
+        Err(StepError::Environment(source)) => Err(failed(source)),
+        Err(StepError::Policy(source)) => Err(EvaluationError::Policy { seed, source }),
+    }
 }
 
 /// Evaluates on `episodes` episodes, of the seeds `first_seed`, `first_seed + 2`, ...: a stride of two
 /// keeps training seeds even and validation seeds odd. One thread for each policy given; the result
-/// does not depend on how many. `progress` is told each report as it comes.
+/// does not depend on how many. `progress` is told of each episode as it comes.
 pub fn evaluate(
     problem: &Problem,
     work_cell: &WorkCell,
     policies: &mut [Policy],
     first_seed: u64,
     episodes: usize,
-    progress: impl Fn(&EpisodeReport) + Sync,
+    progress: impl Fn(&EpisodeReport, &Attempt) + Sync,
 ) -> Result<Evaluation, EvaluationError> {
     let started = Instant::now();
     let next = AtomicU64::new(0);
@@ -202,16 +203,17 @@ pub fn evaluate(
                 });
             }
             let seed = first_seed + 2 * index;
-            let report = attempt(&mut environment, policy, seed)?.map(|attempt| EpisodeReport {
-                seed,
-                completed: attempt.rollout.complete,
-                reward: attempt.rollout.total_reward,
-                steps: attempt.rollout.demonstration.steps.len(),
-                image_distance_right: attempt.image_distance_right,
+            let report = attempt(&mut environment, policy, seed)?.map(|attempt| {
+                let report = EpisodeReport {
+                    seed,
+                    completed: attempt.rollout.complete,
+                    reward: attempt.rollout.total_reward,
+                    steps: attempt.rollout.demonstration.steps.len(),
+                    image_distance_right: attempt.image_distance_right,
+                };
+                progress(&report, &attempt);
+                report
             });
-            if let Some(report) = &report {
-                progress(report);
-            }
             outcomes
                 .lock()
                 .expect("no thread panics with the lock")

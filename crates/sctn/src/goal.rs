@@ -1,7 +1,9 @@
 //! Next-step goal modules (paper, section IV-A): which image of the demonstration sequence comes next.
 //!
-//! The module *image distance* is [`Heightmap::nearest`] among the first observation and the sequence.
+//! The module *image distance* is [`Heightmap::nearest`] among the first observation and the sequence; *embedding*
+//! is [`gctn::Embedding::nearest`] among the same.
 
+use bags::Demonstration;
 use gctn::{Goal, GoalConditioning};
 use heightmap::Heightmap;
 
@@ -54,6 +56,25 @@ pub fn goal<'a>(
             image: next,
             last: Some(last),
         },
+    })
+}
+
+/// The images that a goal module compares with: what was seen at the start of a demonstration, and its sequence. Where the one
+/// of index `i` is nearest, `i` goals are reached.
+pub fn known_images(shown: &Demonstration) -> Vec<&Heightmap> {
+    let first = shown.observation(0);
+    std::iter::once(first).chain(shown.goals()).collect()
+}
+
+/// What is seen after each step of a rollout, and how many goals the oracle then counts as reached.
+pub fn reached(
+    rollout: &Demonstration,
+    goal_count: usize,
+) -> impl Iterator<Item = (&Heightmap, usize)> {
+    let mut oracle = NextStepOracle::new(goal_count);
+    rollout.steps.iter().enumerate().map(move |(index, step)| {
+        oracle.observe(step.delta_reward);
+        (rollout.observation(index + 1), oracle.reached())
     })
 }
 

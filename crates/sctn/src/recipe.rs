@@ -89,18 +89,41 @@ pub enum RecipeError {
     },
 }
 
+/// Reads a file, without checking ranges.
+pub(crate) fn read_yaml<T: serde::de::DeserializeOwned>(path: &Path) -> Result<T, RecipeError> {
+    let text = std::fs::read_to_string(path).map_err(|source| RecipeError::Io {
+        path: path.to_owned(),
+        source,
+    })?;
+    serde_yaml_ng::from_str(&text).map_err(|source| RecipeError::Yaml {
+        path: path.to_owned(),
+        source,
+    })
+}
+
+/// Refuses a field out of range.
+pub(crate) fn check_field(
+    path: &Path,
+    field: &'static str,
+    good: bool,
+    value: String,
+    expected: &'static str,
+) -> Result<(), RecipeError> {
+    match good {
+        true => Ok(()),
+        false => Err(RecipeError::Field {
+            path: path.to_owned(),
+            field,
+            value,
+            expected,
+        }),
+    }
+}
+
 impl Recipe {
     /// Reads and checks a recipe.
     pub fn load(path: &Path) -> Result<Self, RecipeError> {
-        let owned = || path.to_owned();
-        let text = std::fs::read_to_string(path).map_err(|source| RecipeError::Io {
-            path: owned(),
-            source,
-        })?;
-        let recipe: Self = serde_yaml_ng::from_str(&text).map_err(|source| RecipeError::Yaml {
-            path: owned(),
-            source,
-        })?;
+        let recipe: Self = read_yaml(path)?;
         recipe.check(path)?;
         Ok(recipe)
     }
@@ -122,18 +145,7 @@ impl Recipe {
                 path: owned(),
                 source,
             })?;
-        let field = |field, good: bool, value: String, expected| {
-            if good {
-                Ok(())
-            } else {
-                Err(RecipeError::Field {
-                    path: owned(),
-                    field,
-                    value,
-                    expected,
-                })
-            }
-        };
+        let field = |field, good, value, expected| check_field(path, field, good, value, expected);
         let Self {
             problems,
             demonstrations,

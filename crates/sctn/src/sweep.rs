@@ -1,7 +1,7 @@
 //! Sweeps: the same training for many problems, agents, numbers of demonstrations and seeds (paper, section VI).
 
 use crate::agent::Agent;
-use crate::recipe::{Recipe, RecipeError, Validation};
+use crate::recipe::{Recipe, RecipeError, Validation, check_field, read_yaml};
 use gctn::{NetworkConfig, TrainingConfig};
 use serde::{Deserialize, Serialize};
 use std::path::Path;
@@ -144,25 +144,8 @@ impl RunResult {
 impl Sweep {
     /// Reads and checks a sweep.
     pub fn load(path: &Path) -> Result<Self, RecipeError> {
-        let text = std::fs::read_to_string(path).map_err(|source| RecipeError::Io {
-            path: path.into(),
-            source,
-        })?;
-        let sweep: Self = serde_yaml_ng::from_str(&text).map_err(|source| RecipeError::Yaml {
-            path: path.into(),
-            source,
-        })?;
-        let field = |field, good: bool, value: String, expected| {
-            if good {
-                return Ok(());
-            }
-            Err(RecipeError::Field {
-                path: path.into(),
-                field,
-                value,
-                expected,
-            })
-        };
+        let sweep: Self = read_yaml(path)?;
+        let field = |field, good, value, expected| check_field(path, field, good, value, expected);
         let some = "at least one";
         let Self {
             problems,

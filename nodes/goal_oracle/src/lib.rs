@@ -9,6 +9,8 @@ use std::time::Duration;
 
 use anyhow::Context as _;
 use bags::Demonstration;
+use gctn::{Embedded, Embedding};
+use heightmap::Workspace;
 use msgs::{
     convert,
     sctn_msgs::{Goal, Heightmap, PickPlace, StepConfirmation, StepResult},
@@ -30,11 +32,26 @@ pub async fn run(node: Node, parameters: GoalOracleParameters) -> anyhow::Result
     let goals = sequence(&demonstration, &parameters.world_frame)
         .with_context(|| format!("parameter demonstration: {}", path.display()))?;
     let decider = match (parameters.goal_module, parameters.require_confirmation) {
-        (GoalModule::ImageDistance, _) => Decider::Image,
+        (GoalModule::ImageDistance | GoalModule::Embedding, _) => Decider::Image,
         (GoalModule::Oracle, true) => Decider::Operator,
         (GoalModule::Oracle, false) => Decider::Outcome,
     };
     let mut oracle = Oracle::new(goals, decider);
+    let images = || {
+        std::iter::once(demonstration.observation(0))
+            .chain(demonstration.goals())
+            .cloned()
+            .collect()
+    };
+    let known = match parameters.goal_module {
+        GoalModule::Oracle => None,
+        GoalModule::ImageDistance => Some(Known::Images(images())),
+        GoalModule::Embedding => {
+            let embedding = Embedding::load(&parameters.embedding);
+            let known = embedding.and_then(|embedding| Known::embedded(embedding, images()));
+            Some(known.context("parameter embedding")?)
+        }
+    };
 
     let goal = node.publisher::<Goal>("goal", Qos::Latched)?;
     let refusals = node.publisher::<StepResult>("step_result", Qos::Event)?;
@@ -43,17 +60,14 @@ pub async fn run(node: Node, parameters: GoalOracleParameters) -> anyhow::Result
     let mut confirmations =
         node.subscription::<StepConfirmation>("step_confirmation", Qos::Event)?;
 
-    // Images to compare with: before the first step, then of each goal.
-    let mut matcher = match decider {
-        Decider::Image => Some(Matcher {
+    let mut matcher = match known {
+        Some(known) => Some(Matcher {
             heightmaps: node.subscription::<Heightmap>("heightmap", Qos::Latched)?,
-            images: std::iter::once(demonstration.observation(0))
-                .chain(demonstration.goals())
-                .cloned()
-                .collect(),
+            workspace: demonstration.observation(0).workspace,
+            known,
             newest: None,
         }),
-        Decider::Operator | Decider::Outcome => None,
+        None => None,
     };
 
     for topic in [proposals.topic(), results.topic()] {
@@ -79,7 +93,7 @@ pub async fn run(node: Node, parameters: GoalOracleParameters) -> anyhow::Result
                 })
             }
         };
-        let change = match (change, &matcher) {
+        let change = match (change, &mut matcher) {
             (Change::None, Some(matcher)) => matcher.decide(&mut oracle),
             (change, _) => change,
         };
@@ -94,27 +108,61 @@ pub async fn run(node: Node, parameters: GoalOracleParameters) -> anyhow::Result
     }
 }
 
-/// The goal module *image distance*.
+/// The goal modules that look at the images.
 struct Matcher {
     heightmaps: node_kit::Subscription<Heightmap>,
-    images: Vec<heightmap::Heightmap>,
+    /// Of the demonstration.
+    workspace: Workspace,
+    known: Known,
     /// With its stamp.
     newest: Option<(Duration, heightmap::Heightmap)>,
 }
 
+/// What is compared with: what was seen before the first step, then each goal.
+enum Known {
+    Images(Vec<heightmap::Heightmap>),
+    Embedded(Box<Embedding>, Vec<Embedded>),
+}
+
+impl Known {
+    fn embedded(
+        embedding: Embedding,
+        images: Vec<heightmap::Heightmap>,
+    ) -> Result<Self, gctn::Error> {
+        let embedded = images.iter().map(|image| embedding.embed(image));
+        let embedded = embedded.collect::<Result<_, _>>()?;
+        Ok(Self::Embedded(Box::new(embedding), embedded))
+    }
+
+    /// How many goals are reached, as far as can be seen.
+    fn reached(&self, seen: &heightmap::Heightmap) -> Result<Option<usize>, gctn::Error> {
+        match self {
+            Self::Images(images) => Ok(seen.nearest(images)),
+            Self::Embedded(embedding, images) => {
+                Ok(Embedding::nearest(&embedding.embed(seen)?, images))
+            }
+        }
+    }
+}
+
 impl Matcher {
     /// Decides by the newest heightmap, if it was seen after the motion that waits for one.
-    fn decide(&self, oracle: &mut Oracle) -> Change {
+    fn decide(&mut self, oracle: &mut Oracle) -> Change {
         let moved = oracle.waits_for_image();
         let moved = moved.and_then(|stamp| convert::time_from_msg(&stamp).ok());
-        match (moved, &self.newest) {
-            (Some(moved), Some((seen, heightmap))) if *seen >= moved => {
-                match heightmap.nearest(&self.images) {
-                    Some(reached) => oracle.matched(reached),
-                    None => Change::None,
-                }
+        let seen = self
+            .newest
+            .take_if(|(seen, _)| moved.is_some_and(|moved| *seen >= moved));
+        let Some((_, heightmap)) = seen else {
+            return Change::None;
+        };
+        match self.known.reached(&heightmap) {
+            Ok(Some(reached)) => oracle.matched(reached),
+            Ok(None) => Change::None,
+            Err(error) => {
+                self.heightmaps.reject(error);
+                Change::None
             }
-            _ => Change::None,
         }
     }
 }
@@ -129,10 +177,10 @@ async fn observed(matcher: &mut Option<Matcher>) {
         .and_then(|stamp| Ok((stamp, convert::heightmap_from_msg(message)?)));
     match read {
         // One of another table would be infinitely far from all images alike.
-        Ok((_, heightmap)) if heightmap.workspace != matcher.images[0].workspace => {
+        Ok((_, heightmap)) if heightmap.workspace != matcher.workspace => {
             matcher.heightmaps.reject(format_args!(
                 "workspace is {:?}, expected that of the demonstration, {:?}",
-                heightmap.workspace, matcher.images[0].workspace
+                heightmap.workspace, matcher.workspace
             ));
         }
         Ok(read) => matcher.newest = Some(read),

@@ -74,7 +74,7 @@ pub enum Refusal {
     NoDecision(u8),
     /// The parameter `require_confirmation` is false.
     #[error(
-        "this oracle decides by itself (require_confirmation is false, or goal_module is image_distance)"
+        "this oracle decides by itself (require_confirmation is false, or goal_module is not oracle)"
     )]
     NotAsked,
 }

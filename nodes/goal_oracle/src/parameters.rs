@@ -14,6 +14,8 @@ pub enum GoalModule {
     Oracle,
     /// The image of the sequence that looks most like what is seen after the motion.
     ImageDistance,
+    /// The same, where the images lie as a trained network embeds them.
+    Embedding,
 }
 
 /// Explained in config/goal_oracle.yaml.
@@ -23,6 +25,7 @@ pub enum GoalModule {
 pub struct GoalOracleParameters {
     pub demonstration: PathBuf,
     pub goal_module: GoalModule,
+    pub embedding: PathBuf,
     pub require_confirmation: bool,
     pub world_frame: String,
 }
@@ -32,6 +35,7 @@ impl Default for GoalOracleParameters {
         Self {
             demonstration: PathBuf::new(),
             goal_module: GoalModule::Oracle,
+            embedding: PathBuf::new(),
             require_confirmation: true,
             world_frame: "world".into(),
         }
@@ -56,6 +60,12 @@ impl Parameters for GoalOracleParameters {
         if self.world_frame.is_empty() {
             return Err(InvalidParameter::new("world_frame", "must not be empty"));
         }
+        if self.goal_module == GoalModule::Embedding && self.embedding == Path::new("") {
+            return Err(InvalidParameter::new(
+                "embedding",
+                "expected the path of a checkpoint with goal_module embedding, found nothing",
+            ));
+        }
         Ok(())
     }
 }
@@ -63,6 +73,16 @@ impl Parameters for GoalOracleParameters {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn without_a_checkpoint_nothing_is_embedded() {
+        let parameters = GoalOracleParameters {
+            goal_module: GoalModule::Embedding,
+            ..GoalOracleParameters::default()
+        };
+        let error = parameters.validate().unwrap_err().to_string();
+        assert!(error.contains("embedding"), "{error}");
+    }
 
     #[test]
     fn the_configuration_file_holds_the_defaults() {

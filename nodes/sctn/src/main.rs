@@ -4,8 +4,10 @@ mod bag;
 mod bench;
 mod curves;
 mod demos;
+mod embed;
 mod evaluate;
 mod gallery;
+mod goals;
 mod health;
 mod latency;
 mod launch;
@@ -13,6 +15,7 @@ mod picture;
 mod plain_node;
 mod progress;
 mod root;
+mod search;
 mod sweep;
 mod table;
 mod train;
@@ -46,8 +49,14 @@ enum Command {
     Train(train::Train),
     /// Train and test many policies: problems, agents, demonstrations and seeds
     Sweep(sweep::SweepCommand),
+    /// Find the step weights of a task module, and how complex it is, by black-box optimisation
+    Search(search::SearchCommand),
     /// Print the paper's tables beside the results of sweeps
     Table(table::TableCommand),
+    /// Train the embedding of the goal module of that name on demonstrations
+    Embed(embed::Embed),
+    /// Measure how often each goal module names the right goal
+    Goals(goals::Goals),
     /// Evaluate a policy on held-out episodes
     Evaluate(evaluate::Evaluate),
     /// Launch the graph on a simulated cell, under an operator
@@ -68,6 +77,9 @@ fn main() -> Result<ExitCode> {
         Command::Health(health) => health.run(&root()?),
         Command::Train(train) => train.run(&root()?),
         Command::Sweep(sweep) => sweep.run(&root()?),
+        Command::Search(search) => search.run(&root()?),
+        Command::Embed(embed) => embed.run(&root()?),
+        Command::Goals(goals) => goals.run(&root()?),
         Command::Table(table) => table.run(&root()?),
         Command::Evaluate(evaluate) => evaluate.run(&root()?),
         Command::Launch(launch) => launch.run(&root()?),

@@ -4,7 +4,7 @@ use crate::demos::demonstration;
 use crate::root::Root;
 use anyhow::{Context, Result};
 use clap::Args;
-use gctn::Policy;
+use gctn::{Goal, Policy, ScoreMap};
 use heightmap::Heightmap;
 use heightmap::picture::{self, RgbImage};
 use multiravens::Environment;
@@ -71,20 +71,23 @@ impl Picture {
         write("goal.png", &both(goal))?;
         let checkpoint = self.checkpoint.unwrap_or_else(|| root.shipped_checkpoint());
         gctn::set_threads(1);
-        let decision = Policy::load(&checkpoint)?.decide(&step.observation, goal, &[])?;
-        let scores = |map: &gctn::ScoreMap| {
-            let mut image = picture::scores(&step.observation, map.rows, map.cols, &map.scores);
-            picture::mark(
-                &mut image,
-                &step.observation.workspace,
-                &decision.pick,
-                &decision.place,
-            );
-            image
-        };
+        let policy = Policy::load(&checkpoint)?;
         write(
             "scores.png",
-            &picture::side_by_side(&[scores(&decision.pick_map), scores(&decision.place_map)]),
+            &scores(&policy, &step.observation, goal.into())?,
         )
     }
+}
+
+/// Pick and place scores of a policy over an observation, side by side, with the poses it decides on.
+pub fn scores(policy: &Policy, observation: &Heightmap, goal: Goal<'_>) -> Result<RgbImage> {
+    let decision = policy.decide(observation, goal, &[])?;
+    let over = |map: &ScoreMap| {
+        let mut image = picture::scores(observation, map.rows, map.cols, &map.scores);
+        let (pick, place) = (&decision.pick, &decision.place);
+        picture::mark(&mut image, &observation.workspace, pick, place);
+        image
+    };
+    let maps = [over(&decision.pick_map), over(&decision.place_map)];
+    Ok(picture::side_by_side(&maps))
 }

@@ -50,6 +50,11 @@ impl Root {
         self.join("config/checkpoints/ten_problems.safetensors")
     }
 
+    /// The embedding that comes with the repository.
+    pub fn shipped_embedding(&self) -> PathBuf {
+        self.join("config/checkpoints/embedding.safetensors")
+    }
+
     /// The work cell.
     pub fn work_cell(&self) -> Result<WorkCell> {
         Ok(WorkCell::load(&self.join("urdf/workcell.urdf"))?)

@@ -88,9 +88,14 @@ impl SweepCommand {
                 .map(|_| Policy::load(&snapshot.checkpoint))
                 .collect::<Result<Vec<_>, _>>()?;
             let bar = progress::bar(episodes as u64, "episodes");
-            let report = evaluate(&problem, &work_cell, &mut policies, seed, episodes, |_| {
-                bar.inc(1)
-            })?;
+            let report = evaluate(
+                &problem,
+                &work_cell,
+                &mut policies,
+                seed,
+                episodes,
+                |_, _| bar.inc(1),
+            )?;
             bar.finish_and_clear();
             Ok(Score {
                 episodes: report.episodes,
@@ -144,7 +149,7 @@ fn device() -> String {
 }
 
 /// Appears whole or not at all: a file there is a run that is done.
-fn write_whole(path: &Path, text: &str) -> Result<()> {
+pub fn write_whole(path: &Path, text: &str) -> Result<()> {
     let part = path.with_extension("json.part");
     std::fs::write(&part, format!("{text}\n"))
         .and_then(|()| std::fs::rename(&part, path))

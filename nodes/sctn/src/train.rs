@@ -239,7 +239,7 @@ fn validate(root: &Root, recipe: &Recipe, snapshot: &mut Snapshot) -> Result<()>
             &mut policies,
             recipe.validation.seed,
             recipe.validation.episodes,
-            |_| (),
+            |_, _| (),
         )?;
         tracing::info!("step {}: {}", snapshot.step, summary(&report));
         snapshot.completion.insert(name.clone(), report.completion);

@@ -103,7 +103,7 @@ fn check(
         &Warp::identity(),
         &mut encoded,
     );
-    let input = tensor(encoding, config, &encoded);
+    let input = tensor(encoding, [config.rows, config.cols], &encoded);
     let label = Label {
         pick_px: Point2::new(
             0.4 * config.cols as f64 + 0.13,

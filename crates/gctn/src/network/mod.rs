@@ -3,6 +3,7 @@
 mod compact;
 #[cfg(test)]
 mod cross_check;
+mod encoder;
 mod gr_convnet;
 mod heads;
 mod parameters;
@@ -16,7 +17,8 @@ use compact::CompactNet;
 use gr_convnet::GrConvnetNet;
 use resnet43::Resnet43Nets;
 
-pub(crate) use parameters::{Builder, Parameters};
+pub(crate) use encoder::Encoder;
+pub(crate) use parameters::{Builder, Conv, Init, Parameters};
 
 /// What a network says about a batch.
 pub(crate) struct Features {

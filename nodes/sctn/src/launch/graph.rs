@@ -14,6 +14,12 @@ pub struct Settings {
     pub seed: u64,
     pub demonstration: PathBuf,
     pub checkpoint: PathBuf,
+    /// What says which goal is next, as goal_oracle names it.
+    pub goal_module: String,
+    /// Checkpoint for the goal module of that name.
+    pub embedding: PathBuf,
+    /// Whether nothing moves, and with the oracle nothing advances, without an operator's word.
+    pub operated: bool,
 }
 
 const NODES: [&str; 5] = [
@@ -34,9 +40,17 @@ impl Settings {
                 ("problems_dir", path(&root.join("config/problems"))),
                 ("urdf", path(&root.join("urdf/workcell.urdf"))),
             ],
-            "goal_oracle" => vec![("demonstration", path(&self.demonstration))],
+            "goal_oracle" => vec![
+                ("demonstration", path(&self.demonstration)),
+                ("goal_module", self.goal_module.clone()),
+                ("embedding", path(&self.embedding)),
+                ("require_confirmation", self.operated.to_string()),
+            ],
             "gctn_policy" => vec![("checkpoint", path(&self.checkpoint))],
-            "suction_executor" => vec![("urdf", path(&root.join("urdf/workcell.urdf")))],
+            "suction_executor" => vec![
+                ("urdf", path(&root.join("urdf/workcell.urdf"))),
+                ("require_approval", self.operated.to_string()),
+            ],
             _ => Vec::new(),
         }
     }

@@ -27,6 +27,11 @@ const PATIENCE: Duration = Duration::from_secs(60);
 /// Refusals of an approval in a row after which the operator gives up.
 const MAX_REFUSALS: u32 = 5;
 
+/// The goal module that an operator answers to.
+const ORACLE: &str = "oracle";
+/// A run whose last goal is reached may still owe the result and reward of its last step.
+const LAST_RESULT: Duration = Duration::from_secs(5);
+
 /// Arguments of `sctn launch`.
 #[derive(Args)]
 pub struct Launch {
@@ -39,9 +44,15 @@ pub struct Launch {
     /// Who approves proposals and confirms steps
     #[arg(long, value_enum, default_value = "auto")]
     operator: OperatorKind,
+    /// What says which goal is next: the operator, or what is seen after a motion
+    #[arg(long, value_parser = ["oracle", "image_distance", "embedding"], default_value = ORACLE)]
+    goal_module: String,
     /// Checkpoint of the policy [default: the shipped one]
     #[arg(long)]
     checkpoint: Option<PathBuf>,
+    /// Checkpoint for the goal module of that name [default: the shipped one]
+    #[arg(long)]
+    embedding: Option<PathBuf>,
     /// Folder for the bag, the demonstration, logs and a picture of the last heightmap
     #[arg(long)]
     record: Option<PathBuf>,
@@ -102,6 +113,12 @@ impl Launch {
                 .checkpoint
                 .clone()
                 .unwrap_or_else(|| root.shipped_checkpoint()),
+            goal_module: self.goal_module.clone(),
+            embedding: self
+                .embedding
+                .clone()
+                .unwrap_or_else(|| root.shipped_embedding()),
+            operated: self.operator != OperatorKind::Watch,
         };
         gctn::set_threads(1);
         let runtime = tokio::runtime::Builder::new_multi_thread()
@@ -148,7 +165,8 @@ impl Launch {
             .map(|_| RunRecorder::start(&folder.join("run"), settings, self.record_images))
             .transpose()?;
         let (context, node) = plain_node("sctn_launch", &[])?;
-        let mut desk = Desk::new(&node)?;
+        let confirms = settings.operated && settings.goal_module == ORACLE;
+        let mut desk = Desk::new(&node, confirms)?;
         let mut graph = if self.processes {
             Graph::spawn(root, settings, &folder.join("logs"))?
         } else {
@@ -199,6 +217,10 @@ impl Launch {
 /// The operator's desk: what arrives, what is decided, how far the run is.
 struct Desk {
     node: Node,
+    /// Whether the operator says which goal is next.
+    confirms: bool,
+    /// Whether the last goal is said to be reached.
+    goals_reached: bool,
     proposals: node_kit::Subscription<PickPlace>,
     results: node_kit::Subscription<StepResult>,
     rewards: node_kit::Subscription<Reward>,
@@ -218,9 +240,11 @@ struct Desk {
 }
 
 impl Desk {
-    fn new(node: &Node) -> Result<Self> {
+    fn new(node: &Node, confirms: bool) -> Result<Self> {
         Ok(Self {
             node: node.clone(),
+            confirms,
+            goals_reached: false,
             proposals: node.subscription("pick_place", Qos::Latched)?,
             results: node.subscription("step_result", Qos::Event)?,
             rewards: node.subscription("reward", Qos::Event)?,
@@ -249,7 +273,8 @@ impl Desk {
 
     /// Until the run is over: the goal is complete, or the steps are used up.
     async fn work(&mut self, kind: OperatorKind, max_steps: usize) -> Result<()> {
-        while !self.complete && (self.steps < max_steps || kind != OperatorKind::Auto) {
+        let alone = matches!(kind, OperatorKind::Auto | OperatorKind::Watch);
+        while !self.complete && (self.steps < max_steps || !alone) {
             let question = tokio::select! {
                 proposal = self.proposals.recv() => self.operator.proposal(proposal),
                 result = self.results.recv() => self.result(result)?,
@@ -260,13 +285,15 @@ impl Desk {
                 }
                 goal = self.goals.recv() => {
                     self.step_count = goal.step_count;
+                    self.goals_reached = goal.complete;
                     None
                 }
                 heightmap = self.heightmaps.recv() => {
                     self.last_heightmap = Some(heightmap);
                     None
                 }
-                () = tokio::time::sleep(PATIENCE), if kind == OperatorKind::Auto => {
+                () = tokio::time::sleep(LAST_RESULT), if self.goals_reached && !self.confirms => break,
+                () = tokio::time::sleep(PATIENCE), if alone => {
                     bail!("nothing heard for {} s; no node said why: see the logs", PATIENCE.as_secs());
                 }
             };
@@ -317,7 +344,8 @@ impl Desk {
             }
         };
         let decision = match kind {
-            OperatorKind::None => return Ok(()),
+            OperatorKind::None | OperatorKind::Watch => return Ok(()),
+            _ if !self.confirms && matches!(question, Question::Confirm(..)) => return Ok(()),
             OperatorKind::Auto => automatic(&question),
             OperatorKind::Terminal => {
                 let ask = question.clone();

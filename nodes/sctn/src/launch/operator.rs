@@ -11,6 +11,9 @@ pub enum OperatorKind {
     Auto,
     /// Asks the person at the terminal
     Terminal,
+    /// A person who only watches: every proposal is carried out, and the goal module, or with the oracle the motion's
+    /// outcome, says which goal is next. Ctrl-C ends the run
+    Watch,
     /// Nobody here: another program on the topics decides
     None,
 }

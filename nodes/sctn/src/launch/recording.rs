@@ -47,6 +47,7 @@ impl RunRecorder {
         let mut recorder = Recorder::start(&node, path, RecorderOptions::default())?;
         recorder.note("problem", &settings.problem);
         recorder.note("seed", settings.seed);
+        recorder.note("goal_module", &settings.goal_module);
         for (topic, type_name, offered) in TOPICS {
             recorder.expect(topic, type_name, offered)?;
         }

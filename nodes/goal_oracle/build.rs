@@ -1,0 +1,17 @@
+//! Lets the tests, benches and examples of this package find libtorch where torch-sys found it, with
+//! nothing exported. Cargo hands link arguments only to the package that prints them, so every package
+//! that makes an executable with tch in it has a copy of this file and depends on torch-sys directly.
+
+fn main() {
+    println!("cargo::rerun-if-changed=build.rs");
+    if let Ok(libraries) = std::env::var("DEP_TCH_LIBTORCH_LIB") {
+        println!("cargo::rustc-link-arg=-Wl,-rpath,{libraries}");
+    }
+    // A tree that was moved after the build: target/release and target/release/deps.
+    for origin in [
+        "$ORIGIN/../../.libtorch/lib",
+        "$ORIGIN/../../../.libtorch/lib",
+    ] {
+        println!("cargo::rustc-link-arg=-Wl,-rpath,{origin}");
+    }
+}

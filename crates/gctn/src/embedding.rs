@@ -183,14 +183,14 @@ impl EmbeddingTrainer {
         // A stream of its own for each step: the random state is the step's number.
         let mut rng = ChaCha8Rng::seed_from_u64(training.seed);
         rng.set_stream(self.step + 1);
-        let (mut loss, mut right, mut views) = (Tensor::from(0f32), 0.0, 0);
+        let (mut losses, mut right, mut views) = (Vec::new(), 0.0, 0);
         for (index, images) in sequences.iter().enumerate() {
             let (cross_entropy, nearest) = self.contrast(index, images, &mut rng)?;
-            loss = loss + cross_entropy;
+            losses.push(cross_entropy);
             right += nearest;
             views += images.len();
         }
-        let loss = loss / sequences.len() as f64;
+        let loss = Tensor::stack(&losses, 0).mean(Kind::Float);
         let gradients = Tensor::f_run_backward(&[&loss], &self.weights, false, false)?;
         let flat: Vec<Tensor> = gradients
             .iter()

@@ -7,10 +7,12 @@ use anyhow::{Context, Result, bail};
 use clap::Args;
 use cpu_time::ThreadTime;
 use criterion::Criterion;
-use gctn::{NetworkConfig, Policy, Trainer, TrainingConfig};
+use gctn::{NetworkConfig, Policy, Precision, Trainer, TrainingConfig};
 use heightmap::{Fusion, Heightmap, View, Workspace};
 use multiravens::{Environment, Problem};
-use sctn::demonstrate;
+use rand::SeedableRng;
+use rand_chacha::ChaCha8Rng;
+use sctn::{DataSet, Sampling, demonstrate};
 use serde::Serialize;
 use std::collections::BTreeMap;
 use std::hint::black_box;
@@ -86,6 +88,27 @@ const WORKLOADS: &[Workload] = &[
         original_s: Some(5.26),
         samples: 10,
         run: decision_resnet43,
+    },
+    Workload {
+        name: "decision_resnet43_bf16",
+        threads: 2,
+        original_s: Some(5.26),
+        samples: 10,
+        run: decision_resnet43_bf16,
+    },
+    Workload {
+        name: "training_sample_compact",
+        threads: 1,
+        original_s: Some(27.4),
+        samples: 20,
+        run: training_sample_compact,
+    },
+    Workload {
+        name: "training_step_resnet43",
+        threads: 2,
+        original_s: Some(27.4),
+        samples: 10,
+        run: training_step_resnet43,
     },
     Workload {
         name: "frame_to_proposal",
@@ -316,18 +339,65 @@ fn decision_compact(root: &Root, criterion: &mut Criterion, name: &str) -> Resul
     )
 }
 
-/// Random weights cost as much as trained ones.
 fn decision_resnet43(root: &Root, criterion: &mut Criterion, name: &str) -> Result<()> {
+    decision(root, criterion, name, &resnet43(Precision::F32)?.policy()?)
+}
+
+fn decision_resnet43_bf16(root: &Root, criterion: &mut Criterion, name: &str) -> Result<()> {
+    decision(root, criterion, name, &resnet43(Precision::Bf16)?.policy()?)
+}
+
+/// Random weights cost as much as trained ones.
+fn resnet43(precision: Precision) -> Result<Trainer> {
     let training = TrainingConfig {
         threads: 2,
+        precision,
         ..TrainingConfig::published()
     };
-    decision(
-        root,
-        criterion,
-        name,
-        &Trainer::new(&NetworkConfig::resnet43(), &training)?.policy()?,
-    )
+    Ok(Trainer::new(&NetworkConfig::resnet43(), &training)?)
+}
+
+/// Forward, backward and optimiser for one sample, augmented, in bf16 as in `config/recipes/ten_problems.yaml`.
+fn training_sample_compact(root: &Root, criterion: &mut Criterion, name: &str) -> Result<()> {
+    let training = TrainingConfig {
+        batch: 1,
+        precision: Precision::Bf16,
+        ..TrainingConfig::compact()
+    };
+    let trainer = Trainer::new(&NetworkConfig::compact(), &training)?;
+    training_step(root, criterion, name, trainer)
+}
+
+/// As published: one sample a step, over all rotations.
+fn training_step_resnet43(root: &Root, criterion: &mut Criterion, name: &str) -> Result<()> {
+    training_step(root, criterion, name, resnet43(Precision::F32)?)
+}
+
+fn training_step(
+    root: &Root,
+    criterion: &mut Criterion,
+    name: &str,
+    mut trainer: Trainer,
+) -> Result<()> {
+    let mut data = DataSet::default();
+    data.push(demonstration(
+        &root.problem("placing")?,
+        &root.work_cell()?,
+        SEED,
+    )?)?;
+    let mut rng = ChaCha8Rng::seed_from_u64(SEED);
+    let conditioning = trainer.network().conditioning;
+    let sample = data.draw(&Sampling::Plain, conditioning, 0.0, &mut rng)?;
+    trainer.train_step(&[sample])?;
+    let mut failure = None;
+    criterion.bench_function(name, |b| {
+        b.iter(|| {
+            if let Err(error) = trainer.train_step(black_box(&[sample])) {
+                failure = Some(error);
+            }
+        })
+    });
+    failure.map_or(Ok(()), |error| Err(error.into()))
 }
 
 fn decision(root: &Root, criterion: &mut Criterion, name: &str, policy: &Policy) -> Result<()> {

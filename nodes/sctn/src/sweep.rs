@@ -7,7 +7,7 @@ use anyhow::{Context, Result};
 use clap::Args;
 use cpu_time::ProcessTime;
 use gctn::Policy;
-use sctn::{Recipe, Run, RunResult, Score, SnapshotResult, Sweep, evaluate};
+use sctn::{Recipe, Run, RunResult, Score, SnapshotResult, Sweep, evaluate, wilson_95};
 use std::path::{Path, PathBuf};
 
 /// Arguments of `sctn sweep`.
@@ -58,7 +58,16 @@ impl SweepCommand {
             let done = file.exists();
             let state = if done { "done" } else { "to do" };
             tracing::info!("run {} of {}: {slug}, {state}", number + 1, runs.len());
-            if self.list || done {
+            if self.list {
+                continue;
+            }
+            if done {
+                let name = || file.display().to_string();
+                let text = std::fs::read_to_string(&file).with_context(name)?;
+                println!(
+                    "{slug}: {}",
+                    line(&serde_json::from_str(&text).with_context(name)?)
+                );
                 continue;
             }
             let recipe = sweep.recipe(run, modules[&run.problem]);
@@ -66,6 +75,7 @@ impl SweepCommand {
                 .one(root, &sweep, run, recipe)
                 .with_context(|| format!("run {slug}"))?;
             write_whole(&file, &serde_json::to_string_pretty(&result)?)?;
+            println!("{slug}: {}", line(&result));
         }
         Ok(())
     }
@@ -136,6 +146,25 @@ impl SweepCommand {
             snapshots: results,
         })
     }
+}
+
+/// One line for a person: the snapshot chosen on validation episodes, and what all of the run cost.
+fn line(result: &RunResult) -> String {
+    let minutes = result.cpu_seconds / 60.0;
+    let Some(chosen) = result.chosen() else {
+        return format!("no snapshot, {minutes:.1} minutes of processor time");
+    };
+    let Score {
+        episodes,
+        completed,
+        reward,
+    } = chosen.test;
+    let [low, high] = wilson_95(completed, episodes).map(|share| 100.0 * share);
+    format!(
+        "{completed} of {episodes} completed (95 % interval {low:.0} to {high:.0}), reward {reward:.3}, step {}, \
+         {minutes:.1} minutes of processor time for training and evaluations",
+        chosen.step
+    )
 }
 
 /// The processor's name, for people.

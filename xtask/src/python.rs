@@ -9,8 +9,28 @@ use std::process::Command;
 /// Oldest and newest CPython 3 for which there are ROS 2 wheels.
 const ROS_MINORS: std::ops::RangeInclusive<u32> = 10..=13;
 
-/// ROS packages for the tests: ours, and what is needed beside it that has no wheel.
-const MESSAGE_PACKAGES: [&str; 2] = ["msgs", "tests/tf2_msgs"];
+/// A distribution of ROS 2 that the tests run against.
+struct Distribution {
+    /// Folder of the virtual environment.
+    folder: &'static str,
+    requirements: &'static str,
+    /// ROS packages to build: ours, and what is needed beside it that has no wheel.
+    packages: &'static [&'static str],
+}
+
+/// Everything is tested against it.
+const JAZZY: Distribution = Distribution {
+    folder: ".venv",
+    requirements: "tests/requirements.txt",
+    packages: &["msgs", "tests/tf2_msgs"],
+};
+
+/// The table of docs/ros2.md is tested against it too.
+const KILTED: Distribution = Distribution {
+    folder: ".venv.kilted",
+    requirements: "tests/requirements-kilted.txt",
+    packages: &["msgs"],
+};
 
 /// The machine's `python3`, checked to be 3.9 or newer and to have pip.
 pub fn with_pip() -> Result<PathBuf> {
@@ -55,17 +75,28 @@ fn minor_version(python: &Path) -> Result<u32> {
     }
 }
 
-/// The virtual environment in `.venv`.
+/// A virtual environment with ROS 2.
 pub struct Environment {
     prefix: PathBuf,
+    distribution: &'static Distribution,
 }
 
 impl Environment {
-    /// Makes `.venv` with ROS 2 and our messages; does nothing when it is there in the right version.
+    /// Makes `.venv` with ROS 2 Jazzy and our messages; does nothing when it is there in the right version.
     pub fn set_up() -> Result<Self> {
+        Self::of(&JAZZY)
+    }
+
+    /// Makes `.venv.kilted`, the same for ROS 2 Kilted.
+    pub fn set_up_kilted() -> Result<Self> {
+        Self::of(&KILTED)
+    }
+
+    fn of(distribution: &'static Distribution) -> Result<Self> {
         let root = repository_root();
         let environment = Self {
-            prefix: root.join(".venv"),
+            prefix: root.join(distribution.folder),
+            distribution,
         };
         environment.install_packages(&root)?;
         environment.build_messages(&root)?;
@@ -92,7 +123,7 @@ impl Environment {
 
     fn install_packages(&self, root: &Path) -> Result<()> {
         let stamp = self.prefix.join("made-from.txt");
-        let requirements = root.join("tests/requirements.txt");
+        let requirements = root.join(self.distribution.requirements);
         let wanted = fs::read_to_string(&requirements)
             .with_context(|| format!("cannot read {}", requirements.display()))?;
         // A virtual environment holds absolute paths: one that was moved has to be made again.
@@ -125,7 +156,7 @@ impl Environment {
                 "-r",
             ])
             .arg(&requirements))
-        .context("cannot install the packages of tests/requirements.txt")?;
+        .with_context(|| format!("cannot install the packages of {}", requirements.display()))?;
         run(self.python()?.arg(root.join("xtask/repair_ros_wheels.py")))?;
         fs::write(&stamp, recipe).with_context(|| format!("cannot write {}", stamp.display()))
     }
@@ -134,14 +165,14 @@ impl Environment {
     fn build_messages(&self, root: &Path) -> Result<()> {
         let stamp = self.prefix.join("messages-made-from.txt");
         let mut recipe = String::new();
-        for package in MESSAGE_PACKAGES {
+        for package in self.distribution.packages {
             recipe += &message_sources(&root.join(package))?;
         }
         if fs::read_to_string(&stamp).is_ok_and(|text| text == recipe) {
             println!("python: messages present in {}", self.prefix.display());
             return Ok(());
         }
-        for package in MESSAGE_PACKAGES {
+        for package in self.distribution.packages {
             println!("python: building the messages of {package} ...");
             self.build_package(
                 &root.join(package),

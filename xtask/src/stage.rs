@@ -22,8 +22,10 @@ pub enum Stage {
     Doc,
     /// Unit tests and documentation examples of every crate
     Unit,
-    /// Real processes and rclpy: pytest in tests/
+    /// Real processes and rclpy of ROS 2 Jazzy: pytest in tests/
     EndToEnd,
+    /// The table of docs/ros2.md against rclpy of ROS 2 Kilted too
+    Kilted,
 }
 
 impl Stage {
@@ -84,6 +86,14 @@ impl Stage {
                 run(environment
                     .python()?
                     .args(["-m", "pytest", "tests"])
+                    .args(pytest_arguments))
+            }
+            Self::Kilted => {
+                let environment = python::Environment::set_up_kilted()?;
+                build_programs()?;
+                run(environment
+                    .python()?
+                    .args(["-m", "pytest", "tests/test_ros2.py"])
                     .args(pytest_arguments))
             }
         }

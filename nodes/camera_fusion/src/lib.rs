@@ -20,7 +20,7 @@ use msgs::{
     sensor_msgs::{CameraInfo, Image},
     tf2_msgs::TFMessage,
 };
-use node_kit::{Level, Node, Publisher, Qos, Statistics};
+use node_kit::{Active, Level, Node, NodeError, Publisher, Qos, Statistics};
 use tokio::sync::mpsc;
 use tracing::{info, warn};
 
@@ -39,8 +39,11 @@ enum Arrival {
     Info(usize, Box<CameraInfo>),
 }
 
-/// Runs the node.
-pub async fn run(node: Node, parameters: CameraFusionParameters) -> anyhow::Result<()> {
+/// Reads the calibration; what it returns fuses.
+pub async fn configure(
+    node: Node,
+    parameters: CameraFusionParameters,
+) -> anyhow::Result<FusionNode> {
     let poses = if parameters.calibration == Path::new("") {
         BTreeMap::new()
     } else {
@@ -49,32 +52,45 @@ pub async fn run(node: Node, parameters: CameraFusionParameters) -> anyhow::Resu
     if let Some(stranger) = poses.keys().find(|name| !parameters.cameras.contains(name)) {
         warn!("calibration: camera {stranger} is not among the parameter cameras");
     }
-    let mut fusion = FusionNode::new(&node, &parameters, poses)?;
-    let mut transforms = node.subscription::<TFMessage>("/tf_static", Qos::Latched)?;
-    let (sender, mut arrivals) = mpsc::channel(WAITING_ARRIVALS);
-    for (index, camera) in parameters.cameras.iter().enumerate() {
-        fusion.listen(&node, index, camera, &sender)?;
-    }
-    drop(sender);
-    let mut look = tokio::time::interval(LOOK_PERIOD);
-    loop {
-        tokio::select! {
-            arrival = arrivals.recv() => match arrival {
-                Some(arrival) => fusion.arrived(arrival),
-                None => return Ok(()),
-            },
-            message = transforms.recv() => {
-                for reason in fusion.views.transform(message) {
-                    transforms.reject(reason);
+    Ok(FusionNode::new(&node, parameters, poses)?)
+}
+
+impl Active for FusionNode {
+    async fn run(&mut self, node: &Node) -> anyhow::Result<()> {
+        let mut changes = node.parameters::<CameraFusionParameters>();
+        self.take_over(changes.borrow_and_update().clone());
+        self.views = Views::new(&self.parameters, self.poses.clone());
+        self.cameras.clear();
+        let mut transforms = node.subscription::<TFMessage>("/tf_static", Qos::Latched)?;
+        let (sender, mut arrivals) = mpsc::channel(WAITING_ARRIVALS);
+        for (index, camera) in self.parameters.cameras.clone().iter().enumerate() {
+            self.listen(node, index, camera, &sender)?;
+        }
+        drop(sender);
+        let mut look = tokio::time::interval(LOOK_PERIOD);
+        loop {
+            tokio::select! {
+                arrival = arrivals.recv() => match arrival {
+                    Some(arrival) => self.arrived(arrival),
+                    None => return Ok(()),
+                },
+                message = transforms.recv() => {
+                    for reason in self.views.transform(message) {
+                        transforms.reject(reason);
+                    }
+                    self.fuse();
                 }
-                fusion.fuse();
+                _ = look.tick() => self.look_for_silent_cameras(node),
+                Ok(()) = changes.changed() => self.take_over(changes.borrow_and_update().clone()),
             }
-            _ = look.tick() => fusion.look_for_silent_cameras(&node),
         }
     }
 }
 
-struct FusionNode {
+/// The configured node.
+pub struct FusionNode {
+    parameters: CameraFusionParameters,
+    poses: BTreeMap<String, nalgebra::Isometry3<f64>>,
     views: Views,
     cameras: Vec<CameraTopics>,
     timeout: Duration,
@@ -99,11 +115,11 @@ struct CameraTopics {
 impl FusionNode {
     fn new(
         node: &Node,
-        parameters: &CameraFusionParameters,
+        parameters: CameraFusionParameters,
         poses: BTreeMap<String, nalgebra::Isometry3<f64>>,
-    ) -> anyhow::Result<Self> {
+    ) -> Result<Self, NodeError> {
         Ok(Self {
-            views: Views::new(parameters, poses),
+            views: Views::new(&parameters, poses.clone()),
             cameras: Vec::new(),
             timeout: Duration::from_secs_f64(parameters.camera_timeout_s),
             heightmap: node.publisher("heightmap", Qos::Latched)?,
@@ -111,7 +127,16 @@ impl FusionNode {
             preview: node.publisher("heightmap/image", Qos::Latched)?,
             last_fusion: Duration::ZERO,
             fused: 0,
+            parameters,
+            poses,
         })
+    }
+
+    /// Those that may be set at run time.
+    fn take_over(&mut self, parameters: CameraFusionParameters) {
+        self.timeout = Duration::from_secs_f64(parameters.camera_timeout_s);
+        self.views.set_tolerance_s(parameters.tolerance_s);
+        self.parameters = parameters;
     }
 
     /// Subscribes to one camera; each stream is decoded in a task of its own.

@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use heightmap::Workspace;
 use nalgebra::Point2;
-use node_kit::{InvalidParameter, Parameters};
+use node_kit::{InvalidParameter, Parameters, Range};
 use serde::{Deserialize, Serialize};
 
 /// A heightmap of more cells than this does not fit the time that a fusion may take.
@@ -79,6 +79,20 @@ impl WorkspaceParameters {
 }
 
 impl Parameters for CameraFusionParameters {
+    const DOCUMENTATION: &'static str = include_str!("../../../config/camera_fusion.yaml");
+    const RANGES: &'static [(&'static str, Range)] = &[
+        ("tolerance_s", Range::NOT_NEGATIVE),
+        ("camera_timeout_s", Range::Float(0.001, 3600.0)),
+        ("workspace.pixel_size_m", Range::POSITIVE),
+        ("workspace.origin_x_m", Range::FINITE),
+        ("workspace.origin_y_m", Range::FINITE),
+        ("workspace.z_min_m", Range::FINITE),
+        ("workspace.z_max_m", Range::FINITE),
+        ("workspace.rows", Range::Integer(1, MAX_CELLS as i64)),
+        ("workspace.cols", Range::Integer(1, MAX_CELLS as i64)),
+    ];
+    const CHANGEABLE: &'static [&'static str] = &["tolerance_s", "camera_timeout_s"];
+
     fn validate(&self) -> Result<(), InvalidParameter> {
         if self.cameras.is_empty() {
             return Err(InvalidParameter::new("cameras", "must name at least one"));
@@ -94,36 +108,14 @@ impl Parameters for CameraFusionParameters {
         if self.world_frame.is_empty() {
             return Err(InvalidParameter::new("world_frame", "must not be empty"));
         }
-        if !(self.tolerance_s.is_finite() && self.tolerance_s >= 0.0) {
-            return Err(InvalidParameter::new(
-                "tolerance_s",
-                format!("must be 0 or more, is {}", self.tolerance_s),
-            ));
-        }
-        InvalidParameter::unless_positive("camera_timeout_s", self.camera_timeout_s)?;
         let WorkspaceParameters {
-            origin_x_m,
-            origin_y_m,
             rows,
             cols,
-            pixel_size_m,
             z_min_m,
             z_max_m,
+            ..
         } = self.workspace;
-        InvalidParameter::unless_positive("workspace.pixel_size_m", pixel_size_m)?;
-        for (name, value) in [
-            ("workspace.origin_x_m", origin_x_m),
-            ("workspace.origin_y_m", origin_y_m),
-            ("workspace.z_min_m", z_min_m),
-        ] {
-            if !value.is_finite() {
-                return Err(InvalidParameter::new(
-                    name,
-                    format!("must be finite, is {value}"),
-                ));
-            }
-        }
-        if !(z_max_m.is_finite() && z_max_m > z_min_m) {
+        if z_max_m <= z_min_m {
             return Err(InvalidParameter::new(
                 "workspace.z_max_m",
                 format!("must be above z_min_m = {z_min_m}, is {z_max_m}"),
@@ -145,11 +137,10 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_configuration_file_holds_the_defaults() {
-        let text = include_str!("../../../config/camera_fusion.yaml");
-        let read: CameraFusionParameters =
-            node_kit::load_text("camera_fusion.yaml", text, "/cell/camera_fusion").unwrap();
-        assert_eq!(read, CameraFusionParameters::default());
+    fn the_configuration_file_explains_every_parameter_and_shows_its_default() {
+        let mistakes =
+            node_kit::mistakes_in_documentation::<CameraFusionParameters>("camera_fusion");
+        assert_eq!(mistakes, [""; 0]);
     }
 
     #[test]
@@ -157,7 +148,7 @@ mod tests {
         let refusal = |spoil: fn(&mut CameraFusionParameters)| {
             let mut parameters = CameraFusionParameters::default();
             spoil(&mut parameters);
-            parameters.validate().unwrap_err().name
+            parameters.check().unwrap_err().name
         };
         assert_eq!(refusal(|p| p.cameras.clear()), "cameras");
         assert_eq!(refusal(|p| p.cameras[1] = "front".into()), "cameras");

@@ -80,6 +80,11 @@ pub struct Fused {
 }
 
 impl Views {
+    /// How far from the reference stamp images may be, from the next fusion on.
+    pub fn set_tolerance_s(&mut self, tolerance_s: f64) {
+        self.tolerance = Duration::from_secs_f64(tolerance_s);
+    }
+
     /// `poses` are those of the calibration file, by camera name.
     pub fn new(
         parameters: &CameraFusionParameters,

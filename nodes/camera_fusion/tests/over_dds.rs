@@ -11,14 +11,8 @@ use msgs::{
     std_msgs::Header,
     tf2_msgs::TFMessage,
 };
-use node_kit::{Context, Network, Node, Parameters, Publisher, Qos, RosArguments};
-use serde::{Deserialize, Serialize};
+use node_kit::{Context, Network, NoParameters, Node, Publisher, Qos, RosArguments};
 use tokio::time::timeout;
-
-#[derive(Default, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-struct NoParameters {}
-impl Parameters for NoParameters {}
 
 const LIMIT: Duration = Duration::from_secs(20);
 
@@ -71,7 +65,7 @@ async fn three_cameras_become_one_heightmap_in_time() {
         .start(
             "camera_fusion",
             &arguments,
-            |node, parameters: CameraFusionParameters| camera_fusion::run(node, parameters),
+            |node, parameters: CameraFusionParameters| camera_fusion::configure(node, parameters),
         )
         .unwrap();
     let (node, _) = context.node::<NoParameters>("driver", &arguments).unwrap();

@@ -7,7 +7,10 @@ mod parameters;
 mod picture;
 mod proposer;
 
-use std::time::{Duration, Instant};
+use std::{
+    sync::{Arc, Mutex, PoisonError},
+    time::{Duration, Instant},
+};
 
 use anyhow::{Context as _, bail};
 use gctn::{Decision, GoalConditioning, Policy};
@@ -16,7 +19,7 @@ use msgs::{
     sensor_msgs::Image,
     visualization_msgs::MarkerArray,
 };
-use node_kit::{Level, Node, Publisher, Qos};
+use node_kit::{Active, Level, Node, Publisher, Qos};
 use tokio::sync::mpsc;
 use tracing::{info, warn};
 
@@ -31,22 +34,15 @@ struct Answer {
     took: Duration,
 }
 
-/// Runs the node.
-pub async fn run(node: Node, parameters: GctnPolicyParameters) -> anyhow::Result<()> {
+/// Loads the checkpoint; what it returns proposes.
+pub async fn configure(node: Node, parameters: GctnPolicyParameters) -> anyhow::Result<PolicyNode> {
     let path = parameters.checkpoint()?.to_owned();
-    // Before the network, which takes its time to load: nobody shall be missed meanwhile.
     let outputs = Outputs {
         node: node.clone(),
         proposals: node.publisher("pick_place", Qos::Latched)?,
         markers: node.publisher("pick_place/markers", Qos::Latched)?,
         scores: node.publisher("pick_place/scores", Qos::Latched)?,
     };
-    let mut confirmations =
-        node.subscription::<StepConfirmation>("step_confirmation", Qos::Event)?;
-    let mut results = node.subscription::<StepResult>("step_result", Qos::Event)?;
-    let mut goals = node.subscription::<Goal>("goal", Qos::Latched)?;
-    let mut heightmaps = node.subscription::<Heightmap>("heightmap", Qos::Latched)?;
-
     let radius_m = parameters.exclusion_radius_m;
     let threads = parameters.threads;
     let shown = path.display().to_string();
@@ -66,57 +62,92 @@ pub async fn run(node: Node, parameters: GctnPolicyParameters) -> anyhow::Result
         );
     }
     info!("checkpoint {shown} loaded");
+    Ok(PolicyNode {
+        policy: Arc::new(Mutex::new(policy)),
+        outputs,
+    })
+}
 
-    // One job at a time: the proposer gives the next when it has the answer.
-    let (jobs, mut answers) = start_network(&node, policy);
-    let mut proposer = Proposer::new(ChangeRule {
-        tolerance_m: parameters.observation_tolerance_m as f32,
-        fraction: parameters.observation_changed_fraction,
-    });
-    loop {
-        let job = tokio::select! {
-            heightmap = heightmaps.recv() => proposer.observed(heightmap).unwrap_or_else(|error| {
-                heightmaps.reject(error);
-                None
-            }),
-            goal = goals.recv() => proposer.wanted(goal).unwrap_or_else(|error| {
-                goals.reject(error);
-                None
-            }),
-            confirmation = confirmations.recv() => {
-                proposer.confirmed(&confirmation);
-                None
-            }
-            result = results.recv() => proposer.result(&result),
-            answer = answers.recv() => {
-                let answer = answer.context("the network's thread has ended")?;
-                let decision = answer.decision.as_ref().map_err(Clone::clone);
-                let (proposal, job) = proposer.decided(decision);
-                if let Some(proposal) = proposal {
-                    outputs.publish(proposal, &answer);
+/// The configured node.
+pub struct PolicyNode {
+    policy: Arc<Mutex<Policy>>,
+    outputs: Outputs,
+}
+
+impl Active for PolicyNode {
+    /// Begins anew: goal and heightmap are latched, so what is open is proposed again, under the same id.
+    async fn run(&mut self, node: &Node) -> anyhow::Result<()> {
+        let mut confirmations =
+            node.subscription::<StepConfirmation>("step_confirmation", Qos::Event)?;
+        let mut results = node.subscription::<StepResult>("step_result", Qos::Event)?;
+        let mut goals = node.subscription::<Goal>("goal", Qos::Latched)?;
+        let mut heightmaps = node.subscription::<Heightmap>("heightmap", Qos::Latched)?;
+        // One job at a time: the proposer gives the next when it has the answer.
+        let (jobs, mut answers) = start_network(node, Arc::clone(&self.policy));
+        let mut changes = node.parameters::<GctnPolicyParameters>();
+        let mut proposer = Proposer::new(change_rule(&changes.borrow_and_update()));
+        loop {
+            let job = tokio::select! {
+                heightmap = heightmaps.recv() => proposer.observed(heightmap).unwrap_or_else(|error| {
+                    heightmaps.reject(error);
+                    None
+                }),
+                goal = goals.recv() => proposer.wanted(goal).unwrap_or_else(|error| {
+                    goals.reject(error);
+                    None
+                }),
+                confirmation = confirmations.recv() => {
+                    proposer.confirmed(&confirmation);
+                    None
                 }
-                job
+                result = results.recv() => proposer.result(&result),
+                answer = answers.recv() => {
+                    let answer = answer.context("the network's thread has ended")?;
+                    let decision = answer.decision.as_ref().map_err(Clone::clone);
+                    let (proposal, job) = proposer.decided(decision);
+                    if let Some(proposal) = proposal {
+                        self.outputs.publish(proposal, &answer);
+                    }
+                    job
+                }
+                Ok(()) = changes.changed() => {
+                    proposer.set_change_rule(change_rule(&changes.borrow_and_update()));
+                    None
+                }
+            };
+            if let Some(job) = job {
+                jobs.send(job)
+                    .await
+                    .context("the network's thread has ended")?;
             }
-        };
-        if let Some(job) = job {
-            jobs.send(job)
-                .await
-                .context("the network's thread has ended")?;
         }
     }
 }
 
+fn change_rule(parameters: &GctnPolicyParameters) -> ChangeRule {
+    ChangeRule {
+        tolerance_m: parameters.observation_tolerance_m as f32,
+        fraction: parameters.observation_changed_fraction,
+    }
+}
+
 /// Decides on a thread of its own until the sender is dropped.
-fn start_network(node: &Node, policy: Policy) -> (mpsc::Sender<Job>, mpsc::Receiver<Answer>) {
+fn start_network(
+    node: &Node,
+    policy: Arc<Mutex<Policy>>,
+) -> (mpsc::Sender<Job>, mpsc::Receiver<Answer>) {
     let (jobs, mut waiting) = mpsc::channel::<Job>(1);
     let (answers, answered) = mpsc::channel(1);
     node.spawn_blocking(move || {
         while let Some(job) = waiting.blocking_recv() {
+            // Held by the thread of an earlier activation until its last decision is made.
+            let policy = policy.lock().unwrap_or_else(PoisonError::into_inner);
             let start = Instant::now();
             let decision = policy
                 .decide(&job.observation, &*job.goal, &job.exclude)
                 .map_err(|error| error.to_string());
             let took = start.elapsed();
+            drop(policy);
             let answer = Answer {
                 job,
                 decision,

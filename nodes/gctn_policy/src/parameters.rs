@@ -2,7 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
-use node_kit::{InvalidParameter, Parameters};
+use node_kit::{InvalidParameter, Parameters, Range};
 use serde::{Deserialize, Serialize};
 
 /// Explained in config/gctn_policy.yaml.
@@ -43,27 +43,15 @@ impl GctnPolicyParameters {
 }
 
 impl Parameters for GctnPolicyParameters {
-    fn validate(&self) -> Result<(), InvalidParameter> {
-        if !(1..=256).contains(&self.threads) {
-            return Err(InvalidParameter::new(
-                "threads",
-                format!("must be 1 to 256, is {}", self.threads),
-            ));
-        }
-        for (name, value) in [
-            ("exclusion_radius_m", self.exclusion_radius_m),
-            ("observation_tolerance_m", self.observation_tolerance_m),
-        ] {
-            InvalidParameter::unless_positive(name, value)?;
-        }
-        if !(0.0..=1.0).contains(&self.observation_changed_fraction) {
-            return Err(InvalidParameter::new(
-                "observation_changed_fraction",
-                format!("must be 0 to 1, is {}", self.observation_changed_fraction),
-            ));
-        }
-        Ok(())
-    }
+    const DOCUMENTATION: &'static str = include_str!("../../../config/gctn_policy.yaml");
+    const RANGES: &'static [(&'static str, Range)] = &[
+        ("threads", Range::Integer(1, 256)),
+        ("exclusion_radius_m", Range::POSITIVE),
+        ("observation_tolerance_m", Range::POSITIVE),
+        ("observation_changed_fraction", Range::SHARE),
+    ];
+    const CHANGEABLE: &'static [&'static str] =
+        &["observation_tolerance_m", "observation_changed_fraction"];
 }
 
 #[cfg(test)]
@@ -71,10 +59,8 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_configuration_file_holds_the_defaults() {
-        let text = include_str!("../../../config/gctn_policy.yaml");
-        let read: GctnPolicyParameters =
-            node_kit::load_text("gctn_policy.yaml", text, "/cell/gctn_policy").unwrap();
-        assert_eq!(read, GctnPolicyParameters::default());
+    fn the_configuration_file_explains_every_parameter_and_shows_its_default() {
+        let mistakes = node_kit::mistakes_in_documentation::<GctnPolicyParameters>("gctn_policy");
+        assert_eq!(mistakes, [""; 0]);
     }
 }

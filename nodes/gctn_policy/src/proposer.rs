@@ -95,6 +95,11 @@ impl Proposer {
         }
     }
 
+    /// From the next observation on.
+    pub fn set_change_rule(&mut self, change: ChangeRule) {
+        self.change = change;
+    }
+
     /// A heightmap has arrived. Ones that are older than the newest are ignored, unless the clock was set
     /// back, which only a new goal with an older stamp tells.
     pub fn observed(

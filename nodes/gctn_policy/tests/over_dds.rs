@@ -11,15 +11,9 @@ use msgs::{
     sensor_msgs::Image,
 };
 use node_kit::{
-    Context, Network as DdsNetwork, ParameterSource, Parameters, Qos, RosArguments, Subscription,
+    Context, Network as DdsNetwork, NoParameters, ParameterSource, Qos, RosArguments, Subscription,
 };
-use serde::{Deserialize, Serialize};
 use tokio::time::timeout;
-
-#[derive(Default, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-struct NoParameters {}
-impl Parameters for NoParameters {}
 
 const LIMIT: Duration = Duration::from_secs(30);
 const CELLS: usize = 32;
@@ -122,7 +116,7 @@ async fn proposals_follow_goals_rejections_and_changed_scenes() {
         .start(
             "gctn_policy",
             &arguments,
-            |node, parameters: GctnPolicyParameters| gctn_policy::run(node, parameters),
+            |node, parameters: GctnPolicyParameters| gctn_policy::configure(node, parameters),
         )
         .unwrap();
 
@@ -191,7 +185,7 @@ async fn without_a_checkpoint_the_node_refuses_to_start() {
         .start(
             "gctn_policy",
             &RosArguments::default(),
-            |node, parameters: GctnPolicyParameters| gctn_policy::run(node, parameters),
+            |node, parameters: GctnPolicyParameters| gctn_policy::configure(node, parameters),
         )
         .unwrap();
     let error = policy.await.unwrap().unwrap_err().to_string();

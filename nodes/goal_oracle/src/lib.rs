@@ -16,7 +16,7 @@ use msgs::{
     sctn_msgs::{Goal, Heightmap, PickPlace, StepConfirmation, StepResult},
     std_msgs::Header,
 };
-use node_kit::{Level, Node, Qos};
+use node_kit::{Active, Level, Node, Publisher, Qos};
 use tracing::{info, warn};
 
 pub use oracle::{Change, Decider, Oracle, Refusal, SequenceError, sequence};
@@ -25,8 +25,8 @@ pub use parameters::{GoalModule, GoalOracleParameters};
 /// How long the first goal waits for policy and executor, so that none of their first words is lost.
 const PEERS: Duration = Duration::from_secs(5);
 
-/// Runs the node.
-pub async fn run(node: Node, parameters: GoalOracleParameters) -> anyhow::Result<()> {
+/// Reads the demonstration; what it returns walks through its goals.
+pub async fn configure(node: Node, parameters: GoalOracleParameters) -> anyhow::Result<OracleNode> {
     let path = parameters.demonstration()?.to_owned();
     let demonstration = Demonstration::read(&path).context("parameter demonstration")?;
     let goals = sequence(&demonstration, &parameters.world_frame)
@@ -36,7 +36,6 @@ pub async fn run(node: Node, parameters: GoalOracleParameters) -> anyhow::Result
         (GoalModule::Oracle, true) => Decider::Operator,
         (GoalModule::Oracle, false) => Decider::Outcome,
     };
-    let mut oracle = Oracle::new(goals, decider);
     let images = || {
         std::iter::once(demonstration.observation(0))
             .chain(demonstration.goals())
@@ -53,67 +52,94 @@ pub async fn run(node: Node, parameters: GoalOracleParameters) -> anyhow::Result
         }
     };
 
-    let goal = node.publisher::<Goal>("goal", Qos::Latched)?;
-    let refusals = node.publisher::<StepResult>("step_result", Qos::Event)?;
-    let mut proposals = node.subscription::<PickPlace>("pick_place", Qos::Latched)?;
-    let mut results = node.subscription::<StepResult>("step_result", Qos::Event)?;
-    let mut confirmations =
-        node.subscription::<StepConfirmation>("step_confirmation", Qos::Event)?;
-
-    let mut matcher = match known {
-        Some(known) => Some(Matcher {
-            heightmaps: node.subscription::<Heightmap>("heightmap", Qos::Latched)?,
+    Ok(OracleNode {
+        goal: node.publisher("goal", Qos::Latched)?,
+        refusals: node.publisher("step_result", Qos::Event)?,
+        oracle: Oracle::new(goals, decider),
+        matching: known.map(|known| Matching {
             workspace: demonstration.observation(0).workspace,
             known,
-            newest: None,
         }),
-        None => None,
-    };
+        parameters,
+    })
+}
 
-    for topic in [proposals.topic(), results.topic()] {
-        if !node.graph().wait_for_publisher(topic, PEERS).await {
-            info!("nobody publishes {topic} yet; the first goal is latched all the same");
+/// The configured node. While it is inactive the run stays where it is.
+pub struct OracleNode {
+    parameters: GoalOracleParameters,
+    oracle: Oracle,
+    /// With a goal module that looks at the images.
+    matching: Option<Matching>,
+    goal: Publisher<Goal>,
+    refusals: Publisher<StepResult>,
+}
+
+impl Active for OracleNode {
+    async fn run(&mut self, node: &Node) -> anyhow::Result<()> {
+        let mut proposals = node.subscription::<PickPlace>("pick_place", Qos::Latched)?;
+        let mut results = node.subscription::<StepResult>("step_result", Qos::Event)?;
+        let mut confirmations =
+            node.subscription::<StepConfirmation>("step_confirmation", Qos::Event)?;
+        let mut matcher = match &mut self.matching {
+            Some(matching) => Some(Matcher {
+                heightmaps: node.subscription::<Heightmap>("heightmap", Qos::Latched)?,
+                matching,
+                newest: None,
+            }),
+            None => None,
+        };
+        let oracle = &mut self.oracle;
+
+        for topic in [proposals.topic(), results.topic()] {
+            if !node.graph().wait_for_publisher(topic, PEERS).await {
+                info!("nobody publishes {topic} yet; the first goal is latched all the same");
+            }
         }
-    }
-    latch(&node, &goal, &oracle);
-    loop {
-        let change = tokio::select! {
-            proposal = proposals.recv() => {
-                oracle.proposed(&proposal);
-                Change::None
-            }
-            result = results.recv() => oracle.result(&result),
-            () = observed(&mut matcher) => Change::None,
-            confirmation = confirmations.recv() => {
-                oracle.confirmed(&confirmation).unwrap_or_else(|refusal| {
-                    warn!("confirmation refused: {refusal}");
-                    confirmations.reject(format_args!("refused: {refusal}"));
-                    refusals.publish(refused(&node, &parameters, &confirmation, &refusal));
+        latch(node, &self.goal, oracle);
+        loop {
+            let change = tokio::select! {
+                proposal = proposals.recv() => {
+                    oracle.proposed(&proposal);
                     Change::None
-                })
-            }
-        };
-        let change = match (change, &mut matcher) {
-            (Change::None, Some(matcher)) => matcher.decide(&mut oracle),
-            (change, _) => change,
-        };
-        match change {
-            Change::None => {}
-            Change::Goal(_) => latch(&node, &goal, &oracle),
-            Change::Stopped => {
-                info!("stopped by the operator");
-                report(&node, &oracle);
+                }
+                result = results.recv() => oracle.result(&result),
+                () = observed(&mut matcher) => Change::None,
+                confirmation = confirmations.recv() => {
+                    oracle.confirmed(&confirmation).unwrap_or_else(|refusal| {
+                        warn!("confirmation refused: {refusal}");
+                        confirmations.reject(format_args!("refused: {refusal}"));
+                        self.refusals.publish(refused(node, &self.parameters, &confirmation, &refusal));
+                        Change::None
+                    })
+                }
+            };
+            let change = match (change, &mut matcher) {
+                (Change::None, Some(matcher)) => matcher.decide(oracle),
+                (change, _) => change,
+            };
+            match change {
+                Change::None => {}
+                Change::Goal(_) => latch(node, &self.goal, oracle),
+                Change::Stopped => {
+                    info!("stopped by the operator");
+                    report(node, oracle);
+                }
             }
         }
     }
 }
 
-/// The goal modules that look at the images.
-struct Matcher {
-    heightmaps: node_kit::Subscription<Heightmap>,
+/// What a goal module that looks at the images knows.
+struct Matching {
     /// Of the demonstration.
     workspace: Workspace,
     known: Known,
+}
+
+/// The goal modules that look at the images.
+struct Matcher<'a> {
+    heightmaps: node_kit::Subscription<Heightmap>,
+    matching: &'a mut Matching,
     /// With its stamp.
     newest: Option<(Duration, heightmap::Heightmap)>,
 }
@@ -145,7 +171,7 @@ impl Known {
     }
 }
 
-impl Matcher {
+impl Matcher<'_> {
     /// Decides by the newest heightmap, if it was seen after the motion that waits for one.
     fn decide(&mut self, oracle: &mut Oracle) -> Change {
         let moved = oracle.waits_for_image();
@@ -156,7 +182,7 @@ impl Matcher {
         let Some((_, heightmap)) = seen else {
             return Change::None;
         };
-        match self.known.reached(&heightmap) {
+        match self.matching.known.reached(&heightmap) {
             Ok(Some(reached)) => oracle.matched(reached),
             Ok(None) => Change::None,
             Err(error) => {
@@ -168,7 +194,7 @@ impl Matcher {
 }
 
 /// Waits for a heightmap; for ever where none is asked for.
-async fn observed(matcher: &mut Option<Matcher>) {
+async fn observed(matcher: &mut Option<Matcher<'_>>) {
     let Some(matcher) = matcher else {
         return std::future::pending().await;
     };
@@ -177,10 +203,10 @@ async fn observed(matcher: &mut Option<Matcher>) {
         .and_then(|stamp| Ok((stamp, convert::heightmap_from_msg(message)?)));
     match read {
         // One of another table would be infinitely far from all images alike.
-        Ok((_, heightmap)) if heightmap.workspace != matcher.workspace => {
+        Ok((_, heightmap)) if heightmap.workspace != matcher.matching.workspace => {
             matcher.heightmaps.reject(format_args!(
                 "workspace is {:?}, expected that of the demonstration, {:?}",
-                heightmap.workspace, matcher.workspace
+                heightmap.workspace, matcher.matching.workspace
             ));
         }
         Ok(read) => matcher.newest = Some(read),
@@ -188,7 +214,7 @@ async fn observed(matcher: &mut Option<Matcher>) {
     }
 }
 
-fn latch(node: &Node, goal: &node_kit::Publisher<Goal>, oracle: &Oracle) {
+fn latch(node: &Node, goal: &Publisher<Goal>, oracle: &Oracle) {
     goal.publish(oracle.goal());
     let (step, count, attempt) = oracle.progress();
     if oracle.is_complete() {

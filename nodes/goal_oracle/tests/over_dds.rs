@@ -7,15 +7,9 @@ use goal_oracle::GoalOracleParameters;
 use heightmap::{Heightmap, Workspace};
 use msgs::sctn_msgs::{Goal, PickPlace, StepConfirmation, StepResult};
 use nalgebra::Isometry2;
-use node_kit::{Context, Network, ParameterSource, Parameters, Qos, RosArguments, Subscription};
+use node_kit::{Context, Network, NoParameters, ParameterSource, Qos, RosArguments, Subscription};
 use pick_place::{Outcome, PrimitiveSettings};
-use serde::{Deserialize, Serialize};
 use tokio::time::timeout;
-
-#[derive(Default, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-struct NoParameters {}
-impl Parameters for NoParameters {}
 
 const LIMIT: Duration = Duration::from_secs(20);
 
@@ -126,7 +120,7 @@ async fn results_and_confirmations_walk_through_a_demonstration() {
         .start(
             "goal_oracle",
             &arguments,
-            |node, parameters: GoalOracleParameters| goal_oracle::run(node, parameters),
+            |node, parameters: GoalOracleParameters| goal_oracle::configure(node, parameters),
         )
         .unwrap();
 
@@ -234,7 +228,7 @@ async fn by_image_distance_what_is_seen_after_a_motion_says_which_goal_is_next()
         .start(
             "goal_oracle",
             &arguments,
-            |node, parameters: GoalOracleParameters| goal_oracle::run(node, parameters),
+            |node, parameters: GoalOracleParameters| goal_oracle::configure(node, parameters),
         )
         .unwrap();
     let see = |height_m: f32, sec: i32| {
@@ -287,7 +281,7 @@ async fn without_a_demonstration_the_node_refuses_to_start() {
         .start(
             "goal_oracle",
             &RosArguments::default(),
-            |node, parameters: GoalOracleParameters| goal_oracle::run(node, parameters),
+            |node, parameters: GoalOracleParameters| goal_oracle::configure(node, parameters),
         )
         .unwrap();
     let error = oracle.await.unwrap().unwrap_err().to_string();

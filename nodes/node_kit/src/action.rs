@@ -12,6 +12,7 @@ use std::{
     time::Duration,
 };
 
+use futures::StreamExt as _;
 use ros2_client::{
     RmwRequestId,
     action::{
@@ -645,6 +646,20 @@ impl<A: Action + 'static> SentGoal<A> {
                     });
                 }
                 Err(error) => return Err(error),
+            }
+        }
+    }
+
+    /// The next feedback on this goal; for ever where there is none. What comes while nobody waits may be lost to
+    /// another goal of the same client.
+    pub async fn feedback(&self) -> A::Feedback {
+        loop {
+            let stream = self.client.feedback_stream(self.id);
+            futures::pin_mut!(stream);
+            match stream.next().await {
+                Some(Ok(feedback)) => return feedback,
+                Some(Err(error)) => debug!("{}: feedback not read: {error}", self.name),
+                None => std::future::pending().await,
             }
         }
     }

@@ -147,14 +147,15 @@ impl RosArguments {
     }
 
     /// The fully qualified name of a topic, service or action: expands `~`, applies the first
-    /// matching remap, resolves relative names against the namespace.
-    pub fn resolve(&self, node: &str, namespace: &str, name: &str) -> String {
-        let full = expand(node, namespace, name);
+    /// matching remap, resolves relative names against the namespace. `node` is the name before
+    /// remapping, which rules refer to, `full_name` the one after it, with its namespace.
+    pub fn resolve(&self, node: &str, full_name: &str, name: &str) -> String {
+        let full = expand(full_name, name);
         self.remaps
             .iter()
             .filter(|remap| remap.applies_to(node) && !remap.from.starts_with("__"))
-            .find(|remap| expand(node, namespace, &remap.from) == full)
-            .map(|remap| expand(node, namespace, &remap.to))
+            .find(|remap| expand(full_name, &remap.from) == full)
+            .map(|remap| expand(full_name, &remap.to))
             .unwrap_or(full)
     }
 }
@@ -187,12 +188,12 @@ fn rule(
 }
 
 /// Absolute name of `name` as the node sees it.
-fn expand(node: &str, namespace: &str, name: &str) -> String {
-    let namespace = namespace.trim_end_matches('/');
+fn expand(full_name: &str, name: &str) -> String {
+    let namespace = full_name.rsplit_once('/').map_or("", |(above, _)| above);
     if name.starts_with('/') {
         name.to_owned()
     } else if let Some(private) = name.strip_prefix("~/") {
-        format!("{namespace}/{node}/{private}")
+        format!("{full_name}/{private}")
     } else {
         format!("{namespace}/{name}")
     }
@@ -227,12 +228,14 @@ mod tests {
     #[test]
     fn names_resolve_as_in_rcl() {
         let (ros, _) = parse("--ros-args -r goal:=/far/goal -r ~/state:=state").unwrap();
-        assert_eq!(ros.resolve("n", "/", "heightmap"), "/heightmap");
-        assert_eq!(ros.resolve("n", "/cell", "heightmap"), "/cell/heightmap");
-        assert_eq!(ros.resolve("n", "/cell", "/clock"), "/clock");
-        assert_eq!(ros.resolve("n", "/cell", "goal"), "/far/goal");
-        assert_eq!(ros.resolve("n", "/cell", "~/state"), "/cell/state");
-        assert_eq!(ros.resolve("n", "/cell", "~/other"), "/cell/n/other");
+        assert_eq!(ros.resolve("n", "/n", "heightmap"), "/heightmap");
+        assert_eq!(ros.resolve("n", "/n", "~/other"), "/n/other");
+        let in_cell = |name| ros.resolve("n", "/cell/renamed", name);
+        assert_eq!(in_cell("heightmap"), "/cell/heightmap");
+        assert_eq!(in_cell("/clock"), "/clock");
+        assert_eq!(in_cell("goal"), "/far/goal");
+        assert_eq!(in_cell("~/state"), "/cell/state");
+        assert_eq!(in_cell("~/other"), "/cell/renamed/other");
     }
 
     #[test]

@@ -15,13 +15,15 @@ use tracing::{Instrument, error, info};
 
 use crate::{
     arguments::RosArguments,
+    lifecycle::{Active, Lifecycle},
     logging,
     node::Node,
-    parameters::{self, Parameters},
+    parameter_store::ParameterStore,
+    parameters::{self, Loaded, Parameters},
 };
 
-/// How long a node that watches for shutdown may take.
-const GRACE: Duration = Duration::from_secs(2);
+/// How long a node that waits for the end of its work may take to tidy up.
+pub(crate) const GRACE: Duration = Duration::from_secs(2);
 
 /// Where to look for other nodes.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -122,12 +124,22 @@ impl Context {
         }
     }
 
-    /// Makes a node and reads its parameters.
+    /// Makes a node without lifecycle and reads its parameters.
     pub fn node<P: Parameters>(
         &self,
         default_name: &str,
         arguments: &RosArguments,
     ) -> anyhow::Result<(Node, P)> {
+        let (node, loaded) = self.load(default_name, arguments, true)?;
+        Ok((node, loaded.parameters))
+    }
+
+    fn load<P: Parameters>(
+        &self,
+        default_name: &str,
+        arguments: &RosArguments,
+        configured: bool,
+    ) -> anyhow::Result<(Node, Loaded<P>)> {
         let name = arguments.node_name(default_name);
         let namespace = arguments.namespace(default_name).trim_matches('/');
         let full_name = format!("/{namespace}/{name}").replace("//", "/");
@@ -138,28 +150,41 @@ impl Context {
             default_name,
             arguments,
             loaded.use_sim_time,
-            loaded.declared,
+            ParameterStore::new(&loaded, configured)?,
         )?;
-        Ok((node, loaded.parameters))
+        Ok((node, loaded))
     }
 
-    /// Makes a node and runs it as a task, until it ends or the context shuts down.
-    pub fn start<P, F>(
+    /// Makes a node with a managed lifecycle and lets it live as a task, until it ends or the context shuts
+    /// down. `configure` makes what the node does while it is active; it is called again when the node is
+    /// configured again.
+    pub fn start<P, A, F>(
         &self,
         default_name: &str,
         arguments: &RosArguments,
-        run: impl FnOnce(Node, P) -> F,
+        configure: impl Fn(Node, P) -> F + Send + 'static,
     ) -> anyhow::Result<JoinHandle<anyhow::Result<()>>>
     where
         P: Parameters,
-        F: Future<Output = anyhow::Result<()>> + Send + 'static,
+        A: Active,
+        F: Future<Output = anyhow::Result<A>> + Send + 'static,
     {
-        let (node, parameters) = self
-            .node::<P>(default_name, arguments)
+        let (node, loaded) = self
+            .load::<P>(default_name, arguments, false)
             .with_context(|| format!("node {default_name}"))?;
-        let running = run(node.clone(), parameters);
+        let lifecycle = node
+            .span()
+            .in_scope(|| Lifecycle::new(&node, loaded.autostart))?;
         let span = node.span().clone();
-        Ok(tokio::spawn(supervise(node, running).instrument(span)))
+        let life = async move {
+            let result = lifecycle.live(configure).await;
+            if let Err(error) = &result {
+                error!("{error:#}");
+            }
+            node.stop();
+            result
+        };
+        Ok(tokio::spawn(life.instrument(span)))
     }
 
     /// Cancelled when all nodes of this context are to end.
@@ -192,45 +217,21 @@ impl Network {
     }
 }
 
-/// Runs a node to its end, or to the shutdown's.
-async fn supervise(
-    node: Node,
-    running: impl Future<Output = anyhow::Result<()>>,
-) -> anyhow::Result<()> {
-    tokio::pin!(running);
-    let result = tokio::select! {
-        result = &mut running => result,
-        () = node.shutdown_token().cancelled() => {
-            if node.observes_shutdown() {
-                tokio::time::timeout(GRACE, running).await.unwrap_or_else(|_| {
-                    Err(anyhow::anyhow!("not finished {GRACE:?} after shutdown"))
-                })
-            } else {
-                Ok(())
-            }
-        }
-    };
-    if let Err(error) = &result {
-        error!("{error:#}");
-    }
-    node.stop();
-    result
-}
-
 /// The `main` of a node's own executable: ROS arguments, participant, node, and a clean end on
 /// SIGINT and SIGTERM.
 ///
 /// `--parameters` prints the parameters with their defaults. With the environment variable
 /// NODE_KIT_EXIT_WITH_PARENT=1 the node ends when the process that started it is gone.
-pub fn main<P, F>(
+pub fn main<P, A, F>(
     default_name: &'static str,
-    run: impl FnOnce(Node, P) -> F + Send + 'static,
+    configure: impl Fn(Node, P) -> F + Send + 'static,
 ) -> ExitCode
 where
     P: Parameters,
-    F: Future<Output = anyhow::Result<()>> + Send + 'static,
+    A: Active,
+    F: Future<Output = anyhow::Result<A>> + Send + 'static,
 {
-    match run_main(default_name, run) {
+    match run_main(default_name, configure) {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
             eprintln!("{default_name}: {error:#}");
@@ -239,13 +240,14 @@ where
     }
 }
 
-fn run_main<P, F>(
+fn run_main<P, A, F>(
     default_name: &'static str,
-    run: impl FnOnce(Node, P) -> F + Send + 'static,
+    configure: impl Fn(Node, P) -> F + Send + 'static,
 ) -> anyhow::Result<()>
 where
     P: Parameters,
-    F: Future<Output = anyhow::Result<()>> + Send + 'static,
+    A: Active,
+    F: Future<Output = anyhow::Result<A>> + Send + 'static,
 {
     let (arguments, others) = RosArguments::parse(env::args().skip(1))?;
     match others.first().map(String::as_str) {
@@ -267,7 +269,7 @@ where
         .context("tokio runtime")?;
     let result = runtime.block_on(async {
         let context = Context::new(network);
-        let ended = context.start(default_name, &arguments, run)?;
+        let ended = context.start(default_name, &arguments, configure)?;
         let signalled = tokio::spawn({
             let context = context.clone();
             async move {

@@ -115,6 +115,10 @@ fn topic_status(
     let mut troubled = Vec::new();
     for (topic, before) in topics.iter().zip(previous.iter_mut()) {
         let now = topic.snapshot();
+        if topic.quiet && now.errors == 0 {
+            *before = now;
+            continue;
+        }
         let name = &topic.name;
         let direction = match topic.direction {
             Direction::In => "in",

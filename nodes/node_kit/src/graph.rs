@@ -4,10 +4,13 @@
 //! and take from each other, so we look at the discovered endpoints instead.
 
 use std::{
-    fmt,
+    collections::BTreeMap,
+    sync::{Arc, Mutex, MutexGuard, PoisonError},
     time::{Duration, Instant},
 };
 
+use msgs::rmw_dds_common::ParticipantEntitiesInfo;
+use ros2_client::Gid;
 use rustdds::{DomainParticipant, GUID, QosPolicies, RTPSEntity, discovery::DiscoveredWriterData};
 
 use crate::{service::CallError, statistics::Direction};
@@ -79,6 +82,37 @@ impl Graph {
             .await
             .then_some(())
             .ok_or_else(|| unavailable(name, limit))
+    }
+
+    /// Waits until the reader of a client's answers is discovered. rmw names the reader itself in its requests, ros2-client its writer
+    /// of requests.
+    pub(crate) async fn wait_for_answers_to(
+        &self,
+        client: Gid,
+        dds_topic: &str,
+        limit: Duration,
+    ) -> bool {
+        let client = GUID::from(client);
+        if client.prefix == self.participant.guid().prefix {
+            return true;
+        }
+        let heard = || {
+            self.participant.discovered_readers().iter().any(|reader| {
+                let guid = reader.reader_proxy.remote_reader_guid;
+                let same = match client.entity_id.entity_kind.is_reader() {
+                    true => guid == client,
+                    false => guid.prefix == client.prefix,
+                };
+                same && reader.subscription_topic_data.topic_name() == dds_topic
+            })
+        };
+        if heard() {
+            return true;
+        }
+        let came = self.wait(limit, heard).await;
+        // Matching follows discovery.
+        tokio::time::sleep(POLL_PERIOD).await;
+        came
     }
 
     /// Which endpoints of other nodes cannot talk to these, which DDS passes over in silence.
@@ -161,8 +195,50 @@ impl Graph {
     }
 }
 
+/// Participants whose nodes are remembered.
+const MAX_PARTICIPANTS: usize = 1024;
+
+/// Which endpoint belongs to which node, as all say on `ros_discovery_info`.
+#[derive(Clone, Debug, Default)]
+pub(crate) struct NodeNames {
+    participants: Arc<Mutex<BTreeMap<[u8; 16], ParticipantEntitiesInfo>>>,
+}
+
+impl NodeNames {
+    fn participants(&self) -> MutexGuard<'_, BTreeMap<[u8; 16], ParticipantEntitiesInfo>> {
+        self.participants
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner)
+    }
+
+    pub(crate) fn learn(&self, said: ParticipantEntitiesInfo) {
+        let mut participants = self.participants();
+        if participants.len() == MAX_PARTICIPANTS {
+            participants.pop_first();
+        }
+        participants.insert(said.gid.data, said);
+    }
+
+    /// The full name of the node that an endpoint belongs to.
+    pub(crate) fn of(&self, endpoint: GUID) -> Option<String> {
+        let gid = Gid::from(endpoint).to_bytes16();
+        self.participants().values().find_map(|participant| {
+            participant.node_entities_info_seq.iter().find_map(|node| {
+                let mut gids = node.reader_gid_seq.iter().chain(&node.writer_gid_seq);
+                gids.any(|known| known.data == gid).then(|| {
+                    format!(
+                        "{}/{}",
+                        node.node_namespace.trim_end_matches('/'),
+                        node.node_name
+                    )
+                })
+            })
+        })
+    }
+}
+
 /// A publisher or subscription of this node.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, PartialEq)]
 pub(crate) struct Endpoint {
     /// Absolute name of the topic.
     pub topic: String,
@@ -177,12 +253,41 @@ pub(crate) struct Endpoint {
 pub(crate) struct Conflict {
     pub topic: String,
     pub remote: GUID,
-    reason: String,
+    /// Ours.
+    direction: Direction,
+    mismatch: Mismatch,
 }
 
-impl fmt::Display for Conflict {
-    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
-        write!(formatter, "{}: {}", self.topic, self.reason)
+/// What does not fit.
+#[derive(Clone, Debug, PartialEq, Eq)]
+enum Mismatch {
+    /// Our type, and the other's.
+    Type(String, String),
+    /// Which policy.
+    Policy(String),
+}
+
+impl Conflict {
+    /// Names both ends: `ours` and `theirs` are the nodes, the other one where it is known.
+    pub(crate) fn describe(&self, ours: &str, theirs: Option<&str>) -> String {
+        let (own, other) = match self.direction {
+            Direction::In => ("subscription", "publisher"),
+            Direction::Out => ("publisher", "subscription"),
+        };
+        let theirs = match theirs {
+            Some(name) => name.to_owned(),
+            None => format!("a node that has not said its name ({:?})", self.remote),
+        };
+        let topic = &self.topic;
+        match &self.mismatch {
+            Mismatch::Type(our_type, their_type) => format!(
+                "{topic}: the {own} of {ours} has type {our_type}, the {other} of {theirs} has {their_type}"
+            ),
+            Mismatch::Policy(policy) => format!(
+                "{topic}: no messages between the {own} of {ours} and the {other} of {theirs}: the {policy} \
+                 offered is less than the one requested"
+            ),
+        }
     }
 }
 
@@ -198,26 +303,17 @@ impl Endpoint {
         offered: &QosPolicies,
         requested: &QosPolicies,
     ) -> Option<Conflict> {
-        let (ours, other) = match self.direction {
-            Direction::In => ("subscription", "publisher"),
-            Direction::Out => ("publisher", "subscription"),
-        };
-        let reason = if type_name != self.type_name {
-            format!(
-                "this {ours} has type {}, a {other} of another node ({remote:?}) has {type_name}",
-                self.type_name
-            )
+        let mismatch = if type_name != self.type_name {
+            Mismatch::Type(self.type_name.clone(), type_name.to_owned())
         } else {
             let policy = offered.compliance_failure_wrt(requested)?;
-            format!(
-                "no messages between this {ours} and a {other} of another node ({remote:?}): the \
-                 {policy:?} offered is less than the one requested"
-            )
+            Mismatch::Policy(format!("{policy:?}"))
         };
         Some(Conflict {
             topic: self.topic.clone(),
             remote,
-            reason,
+            direction: self.direction,
+            mismatch,
         })
     }
 }

@@ -1,7 +1,7 @@
 //! What ros2-client leaves to us: the one place where our nodes meet the middleware.
 //!
-//! A node is a library with `pub async fn run(node: Node, parameters: P) -> anyhow::Result<()>` and
-//! a small binary that calls [`main`]; [`Context::start`] composes several in one process.
+//! A node is a library with `pub async fn configure(node: Node, parameters: P) -> anyhow::Result<A>`, where `A`
+//! is [`Active`], and a small binary that calls [`main`]; [`Context::start`] composes several in one process.
 
 mod action;
 mod arguments;
@@ -9,8 +9,11 @@ mod clock;
 mod context;
 mod diagnostics;
 mod graph;
+mod lifecycle;
 pub mod logging;
 mod node;
+mod parameter_services;
+mod parameter_store;
 mod parameters;
 mod qos;
 mod raw;
@@ -24,10 +27,16 @@ pub use clock::{Clock, ns_from_stamp, stamp_from_ns};
 pub use context::{Context, ContextError, Network, main, wait_for_end};
 pub use diagnostics::{Diagnostics, Level};
 pub use graph::Graph;
+pub use lifecycle::{Active, LifecycleClient, LifecycleError, State, Transition};
 pub use node::{Node, NodeError};
-pub use parameters::{InvalidParameter, Loaded, ParameterError, Parameters, load_text};
+pub use parameters::{
+    InvalidParameter, Loaded, NoParameters, ParameterError, Parameters, Range, load_text,
+    mistakes_in_documentation,
+};
 pub use qos::Qos;
-pub use raw::{Offer, PublisherId, RawMessage, RawPublisher, RawQos, RawSubscription};
+pub use raw::{
+    AsBytes, NoCdr, Offer, PublisherId, RawMessage, RawPublisher, RawQos, RawSubscription,
+};
 pub use service::{CallError, CallOptions, RequestId, ServiceClient, ServiceServer};
 pub use statistics::{Snapshot, Statistics};
 pub use topic::{Publisher, Subscription};

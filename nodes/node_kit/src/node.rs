@@ -9,15 +9,15 @@ use std::{
 };
 
 use msgs::{
-    Action, Interface, Service, builtin_interfaces, diagnostic_msgs::DiagnosticArray,
-    message_type_name, rosgraph_msgs,
+    Action, Interface, Service, builtin_interfaces, diagnostic_msgs::DiagnosticArray, from_cdr,
+    message_type_name, rmw_dds_common::ParticipantEntitiesInfo, rosgraph_msgs,
 };
 use ros2_client::{
-    Name, NodeName, NodeOptions, ParameterValue, RosoutRaw, ServiceMapping,
+    Name, NodeName, NodeOptions, RosoutRaw, ServiceMapping,
     action::{ActionClientQosPolicies, ActionServerQosPolicies},
 };
-use rustdds::{Topic, TopicKind};
-use tokio::task::JoinHandle;
+use rustdds::{QosPolicies, Topic, TopicKind};
+use tokio::{sync::watch, task::JoinHandle};
 use tokio_util::sync::CancellationToken;
 use tracing::{Instrument, error, warn};
 
@@ -26,8 +26,10 @@ use crate::{
     arguments::RosArguments,
     clock::Clock,
     diagnostics::{self, Diagnostics, Level},
-    graph::{Conflict, Endpoint, Graph},
-    logging,
+    graph::{Conflict, Endpoint, Graph, NodeNames},
+    logging, parameter_services,
+    parameter_store::ParameterStore,
+    parameters::Parameters,
     qos::Qos,
     raw::{self, RawPublisher, RawQos, RawSubscription},
     service::{ServiceClient, ServiceServer},
@@ -74,6 +76,23 @@ impl NodeError {
 #[derive(Clone)]
 pub struct Node {
     inner: Arc<Inner>,
+    scope: Scope,
+}
+
+/// The part of a node's life that tasks belong to: all of it, while it is configured, while it is active.
+#[derive(Clone)]
+struct Scope {
+    end: CancellationToken,
+    observed: Arc<AtomicBool>,
+}
+
+impl Scope {
+    fn new(end: CancellationToken) -> Self {
+        Self {
+            end,
+            observed: Arc::default(),
+        }
+    }
 }
 
 struct Inner {
@@ -83,39 +102,59 @@ struct Inner {
     /// Name before remapping, which remap rules and `-p` rules refer to.
     default_name: String,
     name: String,
-    namespace: String,
     full_name: String,
     clock: Clock,
+    parameters: Arc<ParameterStore>,
     statistics: Mutex<Vec<Arc<Statistics>>>,
-    endpoints: Mutex<Vec<Endpoint>>,
     diagnostics: Diagnostics,
     span: tracing::Span,
-    shutdown: CancellationToken,
-    shutdown_observed: AtomicBool,
+    end: CancellationToken,
 }
 
 impl Inner {
     /// Endpoints of other nodes that cannot talk to ours: a warning once, a state while they last.
-    fn report_conflicts(&self, graph: &Graph, known: &mut Vec<Conflict>) {
-        let endpoints = self
-            .endpoints
-            .lock()
-            .unwrap_or_else(PoisonError::into_inner)
-            .clone();
-        let conflicts = graph.conflicts(&endpoints);
-        for conflict in conflicts.iter().filter(|now| !known.contains(now)) {
-            warn!("{conflict}");
+    fn report_conflicts(
+        &self,
+        graph: &Graph,
+        names: &NodeNames,
+        known: &mut Vec<(Conflict, bool)>,
+    ) {
+        let topics = self.statistics();
+        let in_use = topics.iter().filter(|topic| topic.in_use());
+        let endpoints: Vec<_> = in_use.flat_map(|topic| topic.endpoint.clone()).collect();
+        drop(topics);
+        let mut conflicts = Vec::new();
+        let mut first = None;
+        for conflict in graph.conflicts(&endpoints) {
+            let name = names.of(conflict.remote);
+            let text = conflict.describe(&self.full_name, name.as_deref());
+            let before = known.iter().find(|(before, _)| *before == conflict);
+            // The name of the other node comes later than its endpoints.
+            let due = before.is_some_and(|(_, warned)| !warned);
+            if due {
+                warn!("{text}");
+            }
+            first.get_or_insert(text);
+            conflicts.push((conflict, before.is_some()));
         }
-        match conflicts.first() {
+        match first {
             Some(first) => self.diagnostics.set(
                 "graph",
                 Level::Error,
-                first.to_string(),
+                first,
                 [("conflicts", conflicts.len().to_string())],
             ),
             None => self.diagnostics.clear("graph"),
         }
         *known = conflicts;
+    }
+}
+
+impl Inner {
+    fn statistics(&self) -> MutexGuard<'_, Vec<Arc<Statistics>>> {
+        self.statistics
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner)
     }
 }
 
@@ -128,11 +167,11 @@ impl Drop for Inner {
 impl Node {
     pub(crate) fn new(
         context: ros2_client::Context,
-        shutdown: CancellationToken,
+        end: CancellationToken,
         default_name: &str,
         arguments: &RosArguments,
         use_sim_time: bool,
-        declared: Vec<(String, ParameterValue)>,
+        parameters: ParameterStore,
     ) -> Result<Self, NodeError> {
         let name = arguments.node_name(default_name);
         let namespace = arguments.namespace(default_name);
@@ -144,7 +183,13 @@ impl Node {
         })?;
         let full_name = node_name.fully_qualified_name();
         let mut ros = context
-            .new_node(node_name, options(declared))
+            // Parameters are ours: what ros2-client offers knows no descriptions.
+            .new_node(
+                node_name,
+                NodeOptions::new()
+                    .enable_rosout(true)
+                    .start_parameter_services(false),
+            )
             .map_err(|error| NodeError::middleware("node", &full_name, error))?;
         let spinner = ros
             .spinner()
@@ -159,26 +204,26 @@ impl Node {
                 arguments: arguments.clone(),
                 default_name: default_name.to_owned(),
                 name: name.to_owned(),
-                namespace,
                 full_name,
                 clock,
+                parameters: Arc::new(parameters),
                 statistics: Mutex::default(),
-                endpoints: Mutex::default(),
                 diagnostics: Diagnostics::default(),
                 span,
-                shutdown,
-                shutdown_observed: AtomicBool::new(false),
+                end: end.clone(),
             }),
+            scope: Scope::new(end),
         };
         // Not `spawn`: it ends when the ROS node is dropped, which tells it so.
         let spinning = async move {
             if let Err(error) = spinner.spin().await {
-                error!("discovery and parameter services stopped: {error}");
+                error!("discovery stopped: {error}");
             }
         };
         tokio::spawn(spinning.instrument(node.inner.span.clone()));
         node.follow_clock()?;
         node.publish_diagnostics()?;
+        parameter_services::serve(&node, &node.inner.parameters)?;
         Ok(node)
     }
 
@@ -212,24 +257,52 @@ impl Node {
         Graph::new(self.inner.context.domain_participant())
     }
 
-    /// Waits until the process is told to end. A node that waits for it gets two seconds to tidy
-    /// up; one that does not is dropped where it stands.
-    pub async fn shutdown(&self) {
-        self.inner.shutdown_observed.store(true, Ordering::Relaxed);
-        self.inner.shutdown.cancelled().await;
+    /// The node's parameters: always the newest, and a wait for changes of those that may be set at run time.
+    ///
+    /// # Panics
+    /// When `P` is not the type that the node was made with.
+    pub fn parameters<P: Parameters>(&self) -> watch::Receiver<P> {
+        let newest = self.inner.parameters.newest();
+        newest.expect("the type of parameters that the node was made with")
+    }
+
+    pub(crate) fn parameter_store(&self) -> &ParameterStore {
+        &self.inner.parameters
+    }
+
+    /// Waits until what this handle belongs to is over: in a node's [`run`](crate::Active::run) until the node is
+    /// deactivated or told to end. Whoever waits for it gets two seconds to tidy up; whoever does not is dropped
+    /// where it stands.
+    pub async fn deactivated(&self) {
+        self.scope.observed.store(true, Ordering::Relaxed);
+        self.scope.end.cancelled().await;
     }
 
     /// Ends this node and its background tasks.
     pub fn stop(&self) {
-        self.inner.shutdown.cancel();
+        self.inner.end.cancel();
     }
 
-    pub(crate) fn shutdown_token(&self) -> &CancellationToken {
-        &self.inner.shutdown
+    /// Cancelled when the node is to end.
+    pub(crate) fn end(&self) -> &CancellationToken {
+        &self.inner.end
     }
 
-    pub(crate) fn observes_shutdown(&self) -> bool {
-        self.inner.shutdown_observed.load(Ordering::Relaxed)
+    /// The same node, for a part of its present life.
+    pub(crate) fn scope(&self) -> Self {
+        Self {
+            inner: Arc::clone(&self.inner),
+            scope: Scope::new(self.scope.end.child_token()),
+        }
+    }
+
+    /// Ends what belongs to this part of the node's life.
+    pub(crate) fn leave(&self) {
+        self.scope.end.cancel();
+    }
+
+    pub(crate) fn observes_its_end(&self) -> bool {
+        self.scope.observed.load(Ordering::Relaxed)
     }
 
     /// The span whose events go to `/rosout` under this node's name; enter it on other threads.
@@ -237,13 +310,14 @@ impl Node {
         &self.inner.span
     }
 
-    /// Runs a task in the node's span until it ends or the node does.
+    /// Runs a task in the node's span until it ends, or what this handle belongs to does: the active state, the
+    /// configured one, the node.
     pub fn spawn<T: Send + 'static>(
         &self,
         task: impl Future<Output = T> + Send + 'static,
     ) -> JoinHandle<Option<T>> {
-        let shutdown = self.inner.shutdown.clone();
-        let task = async move { shutdown.run_until_cancelled(task).await };
+        let end = self.scope.end.clone();
+        let task = async move { end.run_until_cancelled(task).await };
         tokio::spawn(task.instrument(self.inner.span.clone()))
     }
 
@@ -262,9 +336,13 @@ impl Node {
 
     /// Absolute name of a topic, service or action after remapping.
     pub fn resolve(&self, name: &str) -> String {
-        self.inner
-            .arguments
-            .resolve(&self.inner.default_name, &self.inner.namespace, name)
+        let Inner {
+            arguments,
+            default_name,
+            full_name,
+            ..
+        } = &*self.inner;
+        arguments.resolve(default_name, full_name, name)
     }
 
     /// Publishes a topic.
@@ -273,15 +351,12 @@ impl Node {
         topic: &str,
         qos: Qos,
     ) -> Result<Publisher<M>, NodeError> {
-        let (name, topic) = self.topic::<M>(topic, qos, Direction::Out)?;
+        let (statistics, topic) = self.topic::<M>(topic, qos, Direction::Out)?;
         let inner = self
             .ros()
             .create_publisher(&topic, None)
-            .map_err(|error| NodeError::middleware("publisher", &name, error))?;
-        Ok(Publisher::new(
-            inner,
-            self.statistics(&name, Direction::Out),
-        ))
+            .map_err(|error| NodeError::middleware("publisher", &statistics.name, error))?;
+        Ok(Publisher::new(inner, statistics))
     }
 
     /// Subscribes to a topic.
@@ -290,15 +365,12 @@ impl Node {
         topic: &str,
         qos: Qos,
     ) -> Result<Subscription<M>, NodeError> {
-        let (name, topic) = self.topic::<M>(topic, qos, Direction::In)?;
+        let (statistics, topic) = self.topic::<M>(topic, qos, Direction::In)?;
         let inner = self
             .ros()
             .create_subscription(&topic, None)
-            .map_err(|error| NodeError::middleware("subscription", &name, error))?;
-        Ok(Subscription::new(
-            inner,
-            self.statistics(&name, Direction::In),
-        ))
+            .map_err(|error| NodeError::middleware("subscription", &statistics.name, error))?;
+        Ok(Subscription::new(inner, statistics))
     }
 
     /// Publishes a topic of any type (its full ROS name, for instance `std_msgs/msg/String`).
@@ -308,21 +380,14 @@ impl Node {
         type_name: &str,
         qos: RawQos,
     ) -> Result<RawPublisher, NodeError> {
-        let (name, topic) = self.raw_topic(topic, type_name, qos)?;
-        let middleware = |error: rustdds::dds::result::CreateError| {
-            NodeError::middleware("publisher", &name, format!("{error:?}"))
-        };
-        let participant = self.inner.context.domain_participant();
-        let publisher = participant
-            .create_publisher(&qos.policies())
-            .map_err(middleware)?;
-        let writer = publisher
-            .create_datawriter_no_key(&topic, Some(qos.policies()))
-            .map_err(middleware)?;
-        Ok(RawPublisher::new(
-            writer,
-            self.statistics(&name, Direction::Out),
-        ))
+        let (statistics, topic) = self.raw_topic(topic, type_name, qos, Direction::Out)?;
+        RawPublisher::new(
+            &self.inner.context.domain_participant(),
+            &topic,
+            qos,
+            Arc::clone(&statistics),
+        )
+        .map_err(|error| NodeError::middleware("publisher", &statistics.name, format!("{error:?}")))
     }
 
     /// Subscribes to a topic of any type.
@@ -332,22 +397,16 @@ impl Node {
         type_name: &str,
         qos: RawQos,
     ) -> Result<RawSubscription, NodeError> {
-        let (name, topic) = self.raw_topic(topic, type_name, qos)?;
-        let middleware = |error: rustdds::dds::result::CreateError| {
-            NodeError::middleware("subscription", &name, format!("{error:?}"))
-        };
-        let participant = self.inner.context.domain_participant();
-        let subscriber = participant
-            .create_subscriber(&qos.policies())
-            .map_err(middleware)?;
-        let reader = subscriber
-            .create_simple_datareader_no_key(&topic, Some(qos.policies()))
-            .map_err(middleware)?;
-        Ok(RawSubscription::new(
-            reader,
-            subscriber,
-            self.statistics(&name, Direction::In),
-        ))
+        let (statistics, topic) = self.raw_topic(topic, type_name, qos, Direction::In)?;
+        RawSubscription::new(
+            &self.inner.context.domain_participant(),
+            &topic,
+            qos,
+            Arc::clone(&statistics),
+        )
+        .map_err(|error| {
+            NodeError::middleware("subscription", &statistics.name, format!("{error:?}"))
+        })
     }
 
     fn raw_topic(
@@ -355,31 +414,42 @@ impl Node {
         name: &str,
         type_name: &str,
         qos: RawQos,
-    ) -> Result<(String, Topic), NodeError> {
-        let (full, _) = self.ros_name("topic", name)?;
+        direction: Direction,
+    ) -> Result<(Arc<Statistics>, Topic), NodeError> {
         let dds_type = raw::dds_type_name(type_name).ok_or_else(|| NodeError::Name {
             what: "type",
             name: type_name.to_owned(),
             reason: "expected PACKAGE/msg/NAME".to_owned(),
         })?;
-        let topic = self
-            .inner
-            .context
-            .domain_participant()
-            .create_topic(
-                format!("rt{full}"),
-                dds_type,
-                &qos.policies(),
-                TopicKind::NoKey,
-            )
-            .map_err(|error| NodeError::middleware("topic", &full, format!("{error:?}")))?;
-        Ok((full, topic))
+        self.dds_topic(name, dds_type, qos.policies(), direction)
     }
 
     /// Answers a service.
     pub fn service_server<S: Service + 'static>(
         &self,
         service: &str,
+    ) -> Result<ServiceServer<S>, NodeError> {
+        let full = self.resolve(service);
+        self.serve(
+            service,
+            self.statistics(Statistics::new(&full, Direction::In)),
+        )
+    }
+
+    /// A service that every node has; `/diagnostics` names it only after errors.
+    pub(crate) fn own_service<S: Service + 'static>(
+        &self,
+        service: &str,
+    ) -> Result<ServiceServer<S>, NodeError> {
+        let service = format!("~/{service}");
+        let statistics = Statistics::new(&self.resolve(&service), Direction::In).quiet();
+        self.serve(&service, self.statistics(statistics))
+    }
+
+    fn serve<S: Service + 'static>(
+        &self,
+        service: &str,
+        statistics: Arc<Statistics>,
     ) -> Result<ServiceServer<S>, NodeError> {
         let (full, name) = self.ros_name("service", service)?;
         let server = self
@@ -392,10 +462,7 @@ impl Node {
                 Qos::Service.profile(),
             )
             .map_err(|error| NodeError::middleware("service", &full, error))?;
-        Ok(ServiceServer::new(
-            server,
-            self.statistics(&full, Direction::In),
-        ))
+        Ok(ServiceServer::new(server, statistics, self.graph()))
     }
 
     /// Calls a service.
@@ -434,7 +501,7 @@ impl Node {
             .ros()
             .create_action_server(ServiceMapping::Enhanced, &name, &A::type_name(), qos)
             .map_err(|error| NodeError::middleware("action", &full, error))?;
-        let statistics = self.statistics(&full, Direction::In);
+        let statistics = self.statistics(Statistics::new(&full, Direction::In));
         self.span()
             .in_scope(|| ActionServer::new(server, self.inner.clock.clone(), statistics))
             .map_err(|error: io::Error| NodeError::middleware("action", &full, error))
@@ -467,13 +534,17 @@ impl Node {
             .unwrap_or_else(PoisonError::into_inner)
     }
 
-    fn statistics(&self, name: &str, direction: Direction) -> Arc<Statistics> {
-        let statistics = Arc::new(Statistics::new(name, direction));
-        self.inner
-            .statistics
-            .lock()
-            .unwrap_or_else(PoisonError::into_inner)
-            .push(Arc::clone(&statistics));
+    /// The counters of a new endpoint: those of one of the same name that is gone, if there was one.
+    fn statistics(&self, new: Statistics) -> Arc<Statistics> {
+        let mut all = self.inner.statistics();
+        let before = all
+            .iter()
+            .find(|old| old.counts_the_same_as(&new) && !old.in_use());
+        if let Some(before) = before {
+            return Arc::clone(before);
+        }
+        let statistics = Arc::new(new);
+        all.push(Arc::clone(&statistics));
         statistics
     }
 
@@ -493,31 +564,38 @@ impl Node {
         name: &str,
         qos: Qos,
         direction: Direction,
-    ) -> Result<(String, Topic), NodeError> {
+    ) -> Result<(Arc<Statistics>, Topic), NodeError> {
+        let dds_type = message_type_name::<M>().dds_msg_type();
+        self.dds_topic(name, dds_type, qos.policies(direction), direction)
+    }
+
+    fn dds_topic(
+        &self,
+        name: &str,
+        type_name: String,
+        policies: QosPolicies,
+        direction: Direction,
+    ) -> Result<(Arc<Statistics>, Topic), NodeError> {
         let (full, _) = self.ros_name("topic", name)?;
-        let endpoint = Endpoint {
-            topic: full.clone(),
-            direction,
-            type_name: message_type_name::<M>().dds_msg_type(),
-            policies: qos.policies(direction),
-        };
         let topic = self
             .inner
             .context
             .domain_participant()
             .create_topic(
                 format!("rt{full}"),
-                endpoint.type_name.clone(),
-                &endpoint.policies,
+                type_name.clone(),
+                &policies,
                 TopicKind::NoKey,
             )
             .map_err(|error| NodeError::middleware("topic", &full, format!("{error:?}")))?;
-        let endpoints = &self.inner.endpoints;
-        endpoints
-            .lock()
-            .unwrap_or_else(PoisonError::into_inner)
-            .push(endpoint);
-        Ok((full, topic))
+        let endpoint = Endpoint {
+            topic: full.clone(),
+            direction,
+            type_name,
+            policies,
+        };
+        let statistics = Statistics::new(&full, direction).of(endpoint);
+        Ok((self.statistics(statistics), topic))
     }
 
     fn follow_clock(&self) -> Result<(), NodeError> {
@@ -537,11 +615,49 @@ impl Node {
         Ok(())
     }
 
+    /// Listens to who has which endpoints.
+    fn follow_node_names(&self) -> Result<NodeNames, NodeError> {
+        const TOPIC: &str = "ros_discovery_info";
+        let qos = RawQos {
+            reliable: true,
+            transient_local: true,
+            depth: 64,
+        };
+        let middleware = |error: rustdds::dds::result::CreateError| {
+            NodeError::middleware("subscription", TOPIC, format!("{error:?}"))
+        };
+        let participant = self.inner.context.domain_participant();
+        let dds_type = message_type_name::<ParticipantEntitiesInfo>().dds_msg_type();
+        let topic = participant
+            .create_topic(
+                TOPIC.to_owned(),
+                dds_type,
+                &qos.policies(),
+                TopicKind::NoKey,
+            )
+            .map_err(middleware)?;
+        let statistics = self.statistics(Statistics::new(TOPIC, Direction::In).quiet());
+        let mut said = RawSubscription::new(&participant, &topic, qos, Arc::clone(&statistics))
+            .map_err(middleware)?;
+        let names = NodeNames::default();
+        let learning = names.clone();
+        self.spawn_background(async move {
+            loop {
+                match from_cdr(&said.recv().await.data) {
+                    Ok(participant) => learning.learn(participant),
+                    Err(error) => statistics.reject(error),
+                }
+            }
+        });
+        Ok(names)
+    }
+
     fn publish_diagnostics(&self) -> Result<(), NodeError> {
         let publisher = self.publisher::<DiagnosticArray>("/diagnostics", Qos::Event)?;
         // Weak, or the task would keep the node alive.
         let weak = Arc::downgrade(&self.inner);
         let graph = self.graph();
+        let names = self.follow_node_names()?;
         self.spawn_background(async move {
             let mut previous = Vec::new();
             let mut known = Vec::new();
@@ -552,12 +668,8 @@ impl Node {
                 let Some(node) = weak.upgrade() else {
                     return;
                 };
-                let topics = node
-                    .statistics
-                    .lock()
-                    .unwrap_or_else(PoisonError::into_inner)
-                    .clone();
-                node.report_conflicts(&graph, &mut known);
+                let topics = node.statistics().clone();
+                node.report_conflicts(&graph, &names, &mut known);
                 publisher.publish(node.diagnostics.report(
                     &node.full_name,
                     node.clock.now(),
@@ -568,20 +680,4 @@ impl Node {
         });
         Ok(())
     }
-}
-
-/// Parameters are read at start; the services show them and refuse changes.
-fn options(declared: Vec<(String, ParameterValue)>) -> NodeOptions {
-    let mut options = NodeOptions::new().enable_rosout(true);
-    for (name, value) in &declared {
-        options = options.declare_parameter(name, value.clone());
-    }
-    options.parameter_validator(Box::new(move |name, value| {
-        let unchanged = declared
-            .iter()
-            .any(|(declared, start)| declared == name && start == value);
-        unchanged
-            .then_some(())
-            .ok_or_else(|| format!("{name} is read-only; restart the node with another value"))
-    }))
 }

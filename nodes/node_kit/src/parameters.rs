@@ -1,19 +1,111 @@
 //! Typed node parameters from `--params-file` and `-p`.
 
-use std::{collections::BTreeMap, fs, path::PathBuf};
+use std::{collections::BTreeMap, fmt, fs, path::PathBuf};
 
-use ros2_client::ParameterValue;
-use serde::{Serialize, de::DeserializeOwned};
+use serde::{Deserialize, Serialize, de::DeserializeOwned};
 use serde_yaml_ng::{Mapping, Value};
 
 use crate::arguments::ParameterSource;
 
 /// The parameters of a node: a serde struct with `#[serde(default, deny_unknown_fields)]`, whose
 /// `Default` is what the node does without any.
-pub trait Parameters: Default + Serialize + DeserializeOwned + Send + 'static {
-    /// Checks what types cannot express: ranges, names, combinations.
+pub trait Parameters:
+    Default + Clone + Serialize + DeserializeOwned + Send + Sync + 'static
+{
+    /// The node's parameter file: the comment above a parameter is its description, here and in
+    /// `describe_parameters`. A parameter without a comment of its own shares that of the line above.
+    const DOCUMENTATION: &'static str = "";
+    /// Dotted names and bounds of numbers.
+    const RANGES: &'static [(&'static str, Range)] = &[];
+    /// Dotted names of those that may be set while the node is configured; the others are read when it is
+    /// configured. The node learns of a change by [`Node::parameters`](crate::Node::parameters).
+    const CHANGEABLE: &'static [&'static str] = &[];
+
+    /// Checks what types and ranges cannot express: names, combinations.
     fn validate(&self) -> Result<(), InvalidParameter> {
         Ok(())
+    }
+
+    /// Checks everything: ranges, then [`validate`](Self::validate).
+    fn check(&self) -> Result<(), InvalidParameter> {
+        for (name, value) in shown(self)? {
+            if let Some((_, range)) = Self::RANGES.iter().find(|(ranged, _)| *ranged == name) {
+                range.check(&name, &value)?;
+            }
+        }
+        self.validate()
+    }
+}
+
+/// No parameters but those that every node has.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct NoParameters {}
+
+impl Parameters for NoParameters {}
+
+/// What every node has, and that is read once, when the node is made: name, description.
+pub(crate) const OF_EVERY_NODE: [(&str, &str); 2] = [
+    ("use_sim_time", "Whether time is that of /clock."),
+    (
+        "autostart",
+        "Whether the node configures and activates itself. False: it waits for a lifecycle manager.",
+    ),
+];
+
+/// Bounds of a number, both included.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum Range {
+    /// Of an integer.
+    Integer(i64, i64),
+    /// Of a float, which has to be finite.
+    Float(f64, f64),
+}
+
+impl Range {
+    /// Above 0.
+    pub const POSITIVE: Self = Self::Float(f64::MIN_POSITIVE, f64::MAX);
+    /// 0 or more.
+    pub const NOT_NEGATIVE: Self = Self::Float(0.0, f64::MAX);
+    /// Any number but infinity and NaN.
+    pub const FINITE: Self = Self::Float(f64::MIN, f64::MAX);
+    /// 0 to 1.
+    pub const SHARE: Self = Self::Float(0.0, 1.0);
+
+    fn check(&self, name: &str, value: &Value) -> Result<(), InvalidParameter> {
+        let (inside, found) = match (self, value) {
+            (Self::Integer(from, to), Value::Number(number)) => (
+                number
+                    .as_i64()
+                    .is_some_and(|number| (*from..=*to).contains(&number)),
+                number.to_string(),
+            ),
+            (Self::Float(from, to), Value::Number(number)) => {
+                let number = number.as_f64().unwrap_or(f64::NAN);
+                // Not a number is in no range.
+                ((*from..=*to).contains(&number), format!("{number}"))
+            }
+            (_, other) => (false, format!("{other:?}")),
+        };
+        if inside {
+            return Ok(());
+        }
+        Err(InvalidParameter::new(
+            name,
+            format!("must be {self}, is {found}"),
+        ))
+    }
+}
+
+impl fmt::Display for Range {
+    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match *self {
+            Self::POSITIVE => write!(formatter, "above 0"),
+            Self::NOT_NEGATIVE => write!(formatter, "0 or more"),
+            Self::FINITE => write!(formatter, "finite"),
+            Self::Integer(from, to) => write!(formatter, "{from} to {to}"),
+            Self::Float(from, to) => write!(formatter, "{from} to {to}"),
+        }
     }
 }
 
@@ -34,14 +126,6 @@ impl InvalidParameter {
             name: name.into(),
             reason: reason.into(),
         }
-    }
-
-    /// Refuses numbers that are not finite and above zero.
-    pub fn unless_positive(name: &str, value: f64) -> Result<(), Self> {
-        if value.is_finite() && value > 0.0 {
-            return Ok(());
-        }
-        Err(Self::new(name, format!("must be above 0, is {value}")))
     }
 }
 
@@ -91,10 +175,10 @@ pub enum ParameterError {
 pub struct Loaded<P> {
     /// The node's own.
     pub parameters: P,
-    /// The parameter that every ROS node has.
+    /// Time is that of `/clock`.
     pub use_sim_time: bool,
-    /// All of them with dotted names, defaults included, as the parameter services show them.
-    pub declared: Vec<(String, ParameterValue)>,
+    /// The node configures and activates itself.
+    pub autostart: bool,
 }
 
 /// Reads the parameters of one node; later sources win, and `-p` wins over files (as in rcl).
@@ -252,33 +336,29 @@ impl Collected {
     }
 
     fn finish<P: Parameters>(mut self) -> Result<Loaded<P>, ParameterError> {
-        let use_sim_time = match self.tree.remove("use_sim_time") {
-            None => false,
-            Some(Value::Bool(on)) => on,
-            Some(other) => {
-                return Err(self.error("use_sim_time", format!("expected a bool, found {other:?}")));
-            }
-        };
+        let use_sim_time = self.of_every_node("use_sim_time", false)?;
+        let autostart = self.of_every_node("autostart", true)?;
         let tree = Value::Mapping(std::mem::take(&mut self.tree));
         let parameters: P = serde_path_to_error::deserialize(tree).map_err(|error| {
             let path = error.path().to_string();
             self.error(&path, error.inner().to_string())
         })?;
         parameters
-            .validate()
+            .check()
             .map_err(|invalid| self.error(&invalid.name, invalid.reason))?;
-        let mut declared = vec![(
-            "use_sim_time".to_owned(),
-            ParameterValue::Boolean(use_sim_time),
-        )];
-        let shown = serde_yaml_ng::to_value(&parameters)
-            .map_err(|error| self.error("", format!("cannot be shown: {error}")))?;
-        flatten("", &shown, &mut declared);
         Ok(Loaded {
             parameters,
             use_sim_time,
-            declared,
+            autostart,
         })
+    }
+
+    fn of_every_node(&mut self, name: &str, default: bool) -> Result<bool, ParameterError> {
+        match self.tree.remove(name) {
+            None => Ok(default),
+            Some(Value::Bool(on)) => Ok(on),
+            Some(other) => Err(self.error(name, format!("expected a bool, found {other:?}"))),
+        }
     }
 
     /// An error that says where the value came from.
@@ -327,8 +407,19 @@ fn matches_name(keys: &[String], full_name: &str) -> bool {
     matches(&pattern, &name)
 }
 
-/// Dotted names for the parameter services, which know no nesting.
-fn flatten(prefix: &str, value: &Value, out: &mut Vec<(String, ParameterValue)>) {
+/// All parameters with dotted names, defaults included.
+pub(crate) fn shown<P: Parameters>(
+    parameters: &P,
+) -> Result<Vec<(String, Value)>, InvalidParameter> {
+    let tree = serde_yaml_ng::to_value(parameters)
+        .map_err(|error| InvalidParameter::new("", format!("cannot be shown: {error}")))?;
+    let mut flat = Vec::new();
+    flatten("", tree, &mut flat);
+    Ok(flat)
+}
+
+/// The parameter services know no nesting.
+fn flatten(prefix: &str, value: Value, out: &mut Vec<(String, Value)>) {
     let Value::Mapping(level) = value else {
         return;
     };
@@ -339,37 +430,98 @@ fn flatten(prefix: &str, value: &Value, out: &mut Vec<(String, ParameterValue)>)
         let name = format!("{prefix}{key}");
         match value {
             Value::Mapping(_) => flatten(&format!("{name}."), value, out),
-            value => out.extend(scalar_or_array(value).map(|value| (name, value))),
+            value => out.push((name, value)),
         }
     }
 }
 
-fn scalar_or_array(value: &Value) -> Option<ParameterValue> {
-    fn all<T>(items: &[Value], read: impl Fn(&Value) -> Option<T>) -> Option<Vec<T>> {
-        items.iter().map(read).collect()
+/// The parameters that these values, with dotted names, stand for; checked.
+pub(crate) fn from_values<'a, P: Parameters>(
+    values: impl IntoIterator<Item = (&'a str, &'a Value)>,
+) -> Result<P, InvalidParameter> {
+    let mut collected = Collected::default();
+    for (name, value) in values {
+        collected.set(name, value.clone(), "");
     }
-    match value {
-        Value::Bool(on) => Some(ParameterValue::Boolean(*on)),
-        Value::Number(number) => Some(match number.as_i64() {
-            Some(integer) => ParameterValue::Integer(integer),
-            None => ParameterValue::Double(number.as_f64()?),
-        }),
-        Value::String(text) => Some(ParameterValue::String(text.clone())),
-        Value::Sequence(items) => all(items, Value::as_bool)
-            .map(ParameterValue::BooleanArray)
-            .or_else(|| all(items, Value::as_i64).map(ParameterValue::IntegerArray))
-            .or_else(|| all(items, Value::as_f64).map(ParameterValue::DoubleArray))
-            .or_else(|| {
-                all(items, |item| item.as_str().map(str::to_owned)).map(ParameterValue::StringArray)
-            }),
-        _ => None,
+    let parameters: P =
+        serde_path_to_error::deserialize(Value::Mapping(collected.tree)).map_err(|error| {
+            InvalidParameter::new(error.path().to_string(), error.inner().to_string())
+        })?;
+    parameters.check()?;
+    Ok(parameters)
+}
+
+/// The description of each parameter in a parameter file: the comment above it, or above the line
+/// before it where nothing separates the two; dotted names.
+pub(crate) fn descriptions(file: &str) -> BTreeMap<String, String> {
+    let mut descriptions = BTreeMap::new();
+    // Open levels: indentation and key.
+    let mut levels: Vec<(usize, &str)> = Vec::new();
+    let mut comment: Vec<&str> = Vec::new();
+    let mut words = String::new();
+    for line in file.lines() {
+        let text = line.trim();
+        if text.is_empty() {
+            comment.clear();
+            words.clear();
+        } else if let Some(said) = text.strip_prefix('#') {
+            comment.push(said.trim());
+        } else if let Some((key, _)) = text.split_once(':').filter(|_| !text.starts_with('-')) {
+            if !comment.is_empty() {
+                words = comment.join(" ");
+                comment.clear();
+            }
+            let indentation = line.len() - line.trim_start().len();
+            levels.retain(|(outer, _)| *outer < indentation);
+            levels.push((indentation, key));
+            // Below the node's name and `ros__parameters`.
+            let path: Vec<&str> = levels.iter().skip(2).map(|(_, key)| *key).collect();
+            if !path.is_empty() && !words.is_empty() {
+                descriptions.insert(path.join("."), words.clone());
+            }
+        }
     }
+    descriptions
+}
+
+/// What is wrong with a node's parameter file and its declarations, for the node's tests: nothing where the
+/// file shows every parameter with its default and explains it, and ranges and changeable names are those of
+/// parameters.
+pub fn mistakes_in_documentation<P: Parameters>(node: &str) -> Vec<String> {
+    let mut mistakes = Vec::new();
+    let file = format!("{node}.yaml");
+    match load_text::<P>(&file, P::DOCUMENTATION, &format!("/{node}")) {
+        Ok(read) => {
+            let (read, default) = (shown(&read), shown(&P::default()));
+            if read != default {
+                mistakes.push(format!("{file} shows {read:?}, defaults are {default:?}"));
+            }
+        }
+        Err(error) => mistakes.push(error.to_string()),
+    }
+    let names: Vec<String> = match shown(&P::default()) {
+        Ok(values) => values.into_iter().map(|(name, _)| name).collect(),
+        Err(error) => return vec![error.to_string()],
+    };
+    let every_node = OF_EVERY_NODE.iter().map(|(name, _)| *name);
+    let described = descriptions(P::DOCUMENTATION);
+    for name in names.iter().map(String::as_str).chain(every_node) {
+        if !described.contains_key(name) {
+            mistakes.push(format!("{file} does not explain {name}"));
+        }
+    }
+    let ranged = P::RANGES.iter().map(|(name, _)| *name);
+    for name in ranged.chain(P::CHANGEABLE.iter().copied()) {
+        if !names.iter().any(|known| known == name) {
+            mistakes.push(format!("{name} is no parameter of {node}"));
+        }
+    }
+    mistakes
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use serde::Deserialize;
 
     #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
     #[serde(default, deny_unknown_fields)]
@@ -402,9 +554,50 @@ mod tests {
     }
 
     impl Parameters for Example {
-        fn validate(&self) -> Result<(), InvalidParameter> {
-            InvalidParameter::unless_positive("tolerance_s", self.tolerance_s)
-        }
+        const DOCUMENTATION: &'static str = "
+fusion:
+  ros__parameters:
+    # Time.
+    use_sim_time: false
+    autostart: true
+
+    # How far apart
+    # stamps may be [s].
+    tolerance_s: 0.5
+    cameras: [front]
+
+    # The grid.
+    grid:
+      rows: 320
+";
+        const RANGES: &'static [(&'static str, Range)] = &[("tolerance_s", Range::POSITIVE)];
+        const CHANGEABLE: &'static [&'static str] = &["tolerance_s"];
+    }
+
+    #[test]
+    fn comments_of_the_file_describe_the_parameters() {
+        assert_eq!(mistakes_in_documentation::<Example>("fusion"), [""; 0]);
+        let described = descriptions(Example::DOCUMENTATION);
+        assert_eq!(described["tolerance_s"], "How far apart stamps may be [s].");
+        assert_eq!(described["cameras"], described["tolerance_s"]);
+        assert_eq!(described["grid.rows"], "The grid.");
+    }
+
+    #[test]
+    fn values_with_dotted_names_make_parameters_again() {
+        let mut values = shown(&Example::default()).unwrap();
+        values[0].1 = Value::from(2.0);
+        let pairs = || values.iter().map(|(name, value)| (name.as_str(), value));
+        let read: Example = from_values(pairs()).unwrap();
+        assert_eq!(read.tolerance_s, 2.0);
+        assert_eq!(read.cameras, ["front"]);
+        values[0].1 = Value::from(f64::NAN);
+        let pairs = || values.iter().map(|(name, value)| (name.as_str(), value));
+        let error = from_values::<Example>(pairs()).unwrap_err();
+        assert_eq!(
+            error.to_string(),
+            "parameter tolerance_s: must be above 0, is NaN"
+        );
     }
 
     fn from_text(text: &str) -> Result<Example, ParameterError> {
@@ -498,14 +691,9 @@ mod tests {
         assert_eq!(loaded.parameters.tolerance_s, 3.0);
         assert_eq!(loaded.parameters.grid.rows, 320);
         assert!(loaded.use_sim_time);
-        let names: Vec<_> = loaded
-            .declared
-            .iter()
-            .map(|(name, _)| name.as_str())
-            .collect();
-        assert_eq!(
-            names,
-            ["use_sim_time", "tolerance_s", "cameras", "grid.rows"]
-        );
+        assert!(loaded.autostart);
+        let names: Vec<_> = shown(&loaded.parameters).unwrap();
+        let names: Vec<_> = names.iter().map(|(name, _)| name.as_str()).collect();
+        assert_eq!(names, ["tolerance_s", "cameras", "grid.rows"]);
     }
 }

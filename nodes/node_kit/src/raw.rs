@@ -4,8 +4,8 @@ use std::{collections::BTreeMap, sync::Arc, time::Duration};
 
 use futures::StreamExt as _;
 use rustdds::{
-    GUID, QosPolicies, QosPolicyBuilder, RepresentationIdentifier, Timestamp, bytes::Bytes, no_key,
-    policy,
+    DomainParticipant, GUID, QosPolicies, QosPolicyBuilder, RepresentationIdentifier, Timestamp,
+    Topic, bytes::Bytes, dds::result::CreateResult, no_key, policy,
 };
 
 use crate::{
@@ -143,8 +143,8 @@ pub struct RawMessage {
     pub lost_before: u64,
 }
 
-pub(crate) type Reader = no_key::SimpleDataReader<Vec<u8>, AsBytes>;
-pub(crate) type Writer = no_key::DataWriter<Vec<u8>, AsBytes>;
+type Reader = no_key::SimpleDataReader<Vec<u8>, AsBytes>;
+type Writer = no_key::DataWriter<Vec<u8>, AsBytes>;
 
 /// Receives a topic of any type.
 pub struct RawSubscription {
@@ -157,16 +157,18 @@ pub struct RawSubscription {
 
 impl RawSubscription {
     pub(crate) fn new(
-        reader: Reader,
-        subscriber: rustdds::Subscriber,
+        participant: &DomainParticipant,
+        topic: &Topic,
+        qos: RawQos,
         statistics: Arc<Statistics>,
-    ) -> Self {
-        Self {
-            reader,
+    ) -> CreateResult<Self> {
+        let subscriber = participant.create_subscriber(&qos.policies())?;
+        Ok(Self {
+            reader: subscriber.create_simple_datareader_no_key(topic, Some(qos.policies()))?,
             _subscriber: subscriber,
             statistics,
             sequence: BTreeMap::new(),
-        }
+        })
     }
 
     /// The next message. Can be cancelled without losing one.
@@ -221,8 +223,15 @@ pub struct RawPublisher {
 }
 
 impl RawPublisher {
-    pub(crate) fn new(writer: Writer, statistics: Arc<Statistics>) -> Self {
-        Self { writer, statistics }
+    pub(crate) fn new(
+        participant: &DomainParticipant,
+        topic: &Topic,
+        qos: RawQos,
+        statistics: Arc<Statistics>,
+    ) -> CreateResult<Self> {
+        let publisher = participant.create_publisher(&qos.policies())?;
+        let writer = publisher.create_datawriter_no_key(topic, Some(qos.policies()))?;
+        Ok(Self { writer, statistics })
     }
 
     /// Sends a message given as little-endian CDR with its header, as nearly all are. `false`: it is not, or the middleware did
@@ -260,14 +269,14 @@ impl RawPublisher {
     }
 }
 
-/// No (de)serialisation: messages stay the bytes that they are.
+/// No (de)serialisation for RustDDS: messages stay the bytes that they are.
 #[derive(Clone)]
-pub(crate) struct AsBytes;
+pub struct AsBytes;
 
-/// Never made: bytes cannot be wrong.
+/// Parameter lists and XCDR2, which ROS does not send.
 #[derive(Debug, thiserror::Error)]
 #[error("{0:?} is no plain CDR")]
-pub(crate) struct NoCdr(RepresentationIdentifier);
+pub struct NoCdr(RepresentationIdentifier);
 
 impl no_key::DeserializerAdapter<Vec<u8>> for AsBytes {
     type Error = NoCdr;

@@ -1,9 +1,13 @@
 //! Services, with retries on the client's side: the first reply may be lost while the two ends are
 //! still discovering each other, so servers must be idempotent.
 
-use std::{sync::Arc, time::Duration};
+use std::{
+    collections::BTreeSet,
+    sync::Arc,
+    time::{Duration, Instant},
+};
 
-use ros2_client::{RmwRequestId, service::CallServiceError};
+use ros2_client::{Gid, RmwRequestId, service::CallServiceError};
 use tokio::{sync::Mutex, time::timeout};
 use tracing::debug;
 
@@ -141,10 +145,20 @@ impl<S: Service> ServiceClient<S> {
     }
 }
 
+/// How long a request waits for its client to be able to hear the answer.
+const HEARING: Duration = Duration::from_millis(500);
+/// Clients that are remembered as able to.
+const MAX_CLIENTS: usize = 1024;
+
 /// Answers a service.
 pub struct ServiceServer<S: Service> {
     server: ros2_client::Server<S::Request, S::Response>,
     statistics: Arc<Statistics>,
+    graph: Graph,
+    /// Clients whose reader of answers is discovered.
+    hearing: BTreeSet<Gid>,
+    /// A request whose client cannot hear the answer yet, and since when.
+    waiting: Option<(RequestId, S::Request, Instant)>,
 }
 
 /// Which request a response answers.
@@ -155,23 +169,56 @@ impl<S: Service> ServiceServer<S> {
     pub(crate) fn new(
         server: ros2_client::Server<S::Request, S::Response>,
         statistics: Arc<Statistics>,
+        graph: Graph,
     ) -> Self {
-        Self { server, statistics }
+        Self {
+            server,
+            statistics,
+            graph,
+            hearing: BTreeSet::new(),
+            waiting: None,
+        }
     }
 
-    /// The next request. Requests that cannot be decoded are counted, warned about and skipped.
+    /// The next request. Requests that cannot be decoded are counted, warned about and skipped. Can be cancelled
+    /// without losing a request.
     pub async fn recv(&mut self) -> (RequestId, S::Request) {
         loop {
+            if let Some((id, _, since)) = &self.waiting {
+                let (client, since) = (id.0.writer_gid, *since);
+                self.wait_until_heard(client, since).await;
+            }
+            if let Some((id, request, _)) = self.waiting.take() {
+                return (id, request);
+            }
             match self.server.async_receive_request().await {
                 Ok((id, request)) => {
                     self.statistics.count_message();
-                    return (RequestId(id), request);
+                    self.waiting = Some((RequestId(id), request, Instant::now()));
                 }
                 Err(error) => {
                     self.statistics.reject(error);
                     tokio::time::sleep(Duration::from_millis(1)).await;
                 }
             }
+        }
+    }
+
+    /// A client's request may come before its reader of answers is discovered, and what is sent to nobody is lost:
+    /// rclpy's first call after `wait_for_service` would have no answer.
+    async fn wait_until_heard(&mut self, client: Gid, since: Instant) {
+        if self.hearing.contains(&client) {
+            return;
+        }
+        let topic = format!("rr{}Reply", self.statistics.name);
+        let limit = HEARING.saturating_sub(since.elapsed());
+        if self.graph.wait_for_answers_to(client, &topic, limit).await {
+            if self.hearing.len() == MAX_CLIENTS {
+                self.hearing.clear();
+            }
+            self.hearing.insert(client);
+        } else {
+            debug!("{}: no reader of answers yet", self.statistics.name);
         }
     }
 

@@ -3,13 +3,15 @@
 use std::{
     fmt::Display,
     sync::{
-        Mutex, MutexGuard, PoisonError,
+        Arc, Mutex, MutexGuard, PoisonError,
         atomic::{AtomicU64, Ordering::Relaxed},
     },
     time::{Duration, Instant},
 };
 
 use tracing::warn;
+
+use crate::graph::Endpoint;
 
 /// At most one warning per period and topic, so that a flood of bad messages floods no log.
 const WARNING_PERIOD: Duration = Duration::from_secs(1);
@@ -26,6 +28,10 @@ pub(crate) enum Direction {
 pub struct Statistics {
     pub(crate) name: String,
     pub(crate) direction: Direction,
+    /// Of a topic.
+    pub(crate) endpoint: Option<Endpoint>,
+    /// Not worth a line in `/diagnostics` while all is well.
+    pub(crate) quiet: bool,
     messages: AtomicU64,
     dropped: AtomicU64,
     errors: AtomicU64,
@@ -60,11 +66,36 @@ impl Statistics {
         Self {
             name: name.to_owned(),
             direction,
+            endpoint: None,
+            quiet: false,
             messages: AtomicU64::new(0),
             dropped: AtomicU64::new(0),
             errors: AtomicU64::new(0),
             recent: Mutex::default(),
         }
+    }
+
+    pub(crate) fn of(self, endpoint: Endpoint) -> Self {
+        let endpoint = Some(endpoint);
+        Self { endpoint, ..self }
+    }
+
+    pub(crate) fn quiet(self) -> Self {
+        Self {
+            quiet: true,
+            ..self
+        }
+    }
+
+    /// Whether the endpoint is still there: it holds these counters too.
+    pub(crate) fn in_use(self: &Arc<Self>) -> bool {
+        Arc::strong_count(self) > 1
+    }
+
+    pub(crate) fn counts_the_same_as(&self, other: &Self) -> bool {
+        self.name == other.name
+            && self.direction == other.direction
+            && self.endpoint == other.endpoint
     }
 
     fn recent(&self) -> MutexGuard<'_, Recent> {

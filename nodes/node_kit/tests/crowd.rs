@@ -7,13 +7,7 @@ use std::{
 };
 
 use msgs::sctn_msgs::StepConfirmation;
-use node_kit::{Context, Network, Node, Parameters, Publisher, Qos, RosArguments, Subscription};
-use serde::{Deserialize, Serialize};
-
-#[derive(Default, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-struct NoParameters {}
-impl Parameters for NoParameters {}
+use node_kit::{Context, Network, NoParameters, Node, Publisher, Qos, RosArguments, Subscription};
 
 const NODES: usize = 8;
 const TOPICS: usize = 24;

@@ -3,27 +3,26 @@
 use std::time::Duration;
 
 use msgs::{
-    Action, Interface, Service,
+    Action, Service,
     control_msgs::{FollowJointTrajectoryGoal, FollowJointTrajectoryResult},
     diagnostic_msgs::DiagnosticArray,
+    rcl_interfaces::{
+        Log, Parameter, ParameterType, ParameterValue, SetParameters, SetParametersRequest,
+    },
     rosgraph_msgs::Clock,
     sensor_msgs::Image,
-    std_msgs::Header,
+    std_msgs::{Float64, Header},
     ur_msgs::{SetIORequest, SetIOResponse},
 };
 use node_kit::{
-    ActionServer, CallOptions, Context, GoalStatus, Network, Node, Parameters, Qos, RosArguments,
+    ActionServer, Active, CallOptions, Context, GoalStatus, LifecycleClient, Network, NoParameters,
+    Node, Parameters, Publisher, Qos, Range, RosArguments, State, Transition,
 };
 use serde::{Deserialize, Serialize};
 use tokio::time::timeout;
 
 type FollowJointTrajectory = msgs::control_msgs::FollowJointTrajectory;
 type SetIO = msgs::ur_msgs::SetIO;
-
-#[derive(Default, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-struct NoParameters {}
-impl Parameters for NoParameters {}
 
 const LIMIT: Duration = Duration::from_secs(20);
 
@@ -106,16 +105,14 @@ async fn a_message_of_another_type_is_counted_and_the_next_one_is_read() {
     let context = context(43);
     let (sender, receiver) = (node(&context, "sender", ""), node(&context, "receiver", ""));
     // Another type on the same topic: its bytes cannot be an image.
-    let wrong = sender
-        .publisher::<msgs::std_msgs::Float64>("x", Qos::Event)
-        .unwrap();
+    let wrong = sender.publisher::<Float64>("x", Qos::Event).unwrap();
     let right = sender.publisher::<Image>("x", Qos::Event).unwrap();
     let mut subscription = receiver.subscription::<Image>("x", Qos::Event).unwrap();
     assert!(sender.graph().wait_for_subscription("/x", LIMIT).await);
     let statistics = subscription.statistics().clone();
     let sending = tokio::spawn(async move {
         loop {
-            wrong.publish(msgs::std_msgs::Float64 { data: 1e300 });
+            wrong.publish(Float64 { data: 1e300 });
             right.publish(image(1));
             tokio::time::sleep(Duration::from_millis(50)).await;
         }
@@ -274,9 +271,7 @@ async fn logs_reach_rosout_and_diagnostics_name_the_topics() {
     let speaker = node(&context, "speaker", "--ros-args -r __ns:=/cell -r a:=b");
     let listener = node(&context, "listener", "");
     let _topic = speaker.publisher::<Header>("a", Qos::Event).unwrap();
-    let mut logs = listener
-        .subscription::<RosoutLog>("/rosout", Qos::Event)
-        .unwrap();
+    let mut logs = listener.subscription::<Log>("/rosout", Qos::Event).unwrap();
     let mut diagnostics = listener
         .subscription::<DiagnosticArray>("/diagnostics", Qos::Event)
         .unwrap();
@@ -289,7 +284,7 @@ async fn logs_reach_rosout_and_diagnostics_name_the_topics() {
     timeout(LIMIT, async {
         loop {
             let log = logs.recv().await;
-            if log.name == "cell.speaker" && log.msg == "hello step=3" && log.level == 30 {
+            if log.name == "cell.speaker" && log.msg == "hello step=3" && log.level == Log::WARN {
                 break;
             }
         }
@@ -340,20 +335,144 @@ async fn endpoints_that_cannot_talk_are_named_in_diagnostics() {
     .expect("three conflicts");
 }
 
-/// rcl_interfaces/Log, which is not among our packages.
-#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
-struct RosoutLog {
-    stamp: msgs::builtin_interfaces::Time,
-    level: u8,
-    name: String,
-    msg: String,
-    file: String,
-    function: String,
-    line: u32,
+/// Speaks while it is active; a `period_ms` of 13 cannot be configured, and 17 fails at work.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+struct SpeakerParameters {
+    period_ms: u64,
+    volume: f64,
 }
-impl ros2_client::Message for RosoutLog {}
-impl Interface for RosoutLog {
-    const TYPE_NAME: &'static str = "rcl_interfaces/msg/Log";
-    const DEFINITION: &'static str = "";
-    const TYPE_HASH: &'static str = "";
+
+impl Default for SpeakerParameters {
+    fn default() -> Self {
+        Self {
+            period_ms: 20,
+            volume: 0.5,
+        }
+    }
+}
+
+impl Parameters for SpeakerParameters {
+    const DOCUMENTATION: &'static str =
+        "speaker:\n  ros__parameters:\n    # How loud.\n    volume: 0.5\n";
+    const RANGES: &'static [(&'static str, Range)] = &[("volume", Range::SHARE)];
+    const CHANGEABLE: &'static [&'static str] = &["volume"];
+}
+
+struct Speaker {
+    said: Publisher<Float64>,
+    period: Duration,
+}
+
+async fn configure(node: Node, parameters: SpeakerParameters) -> anyhow::Result<Speaker> {
+    anyhow::ensure!(parameters.period_ms != 13, "13 brings bad luck");
+    Ok(Speaker {
+        said: node.publisher("said", Qos::Event)?,
+        period: Duration::from_millis(parameters.period_ms),
+    })
+}
+
+impl Active for Speaker {
+    async fn run(&mut self, node: &Node) -> anyhow::Result<()> {
+        let parameters = node.parameters::<SpeakerParameters>();
+        loop {
+            tokio::time::sleep(self.period).await;
+            anyhow::ensure!(self.period.as_millis() != 17, "17 fails");
+            let data = parameters.borrow().volume;
+            self.said.publish(Float64 { data });
+        }
+    }
+}
+
+fn set(name: &str, value: ParameterValue) -> SetParametersRequest {
+    SetParametersRequest {
+        parameters: vec![Parameter {
+            name: name.into(),
+            value,
+        }],
+    }
+}
+
+fn integer(integer_value: i64) -> ParameterValue {
+    ParameterValue {
+        r#type: ParameterType::PARAMETER_INTEGER,
+        integer_value,
+        ..ParameterValue::default()
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_node_is_led_through_its_life() {
+    let context = context(40);
+    let (leader, other) = (node(&context, "leader", ""), self::context(40));
+    let words = "--ros-args -p autostart:=false -p period_ms:=13";
+    let (arguments, _) = RosArguments::parse(words.split_whitespace().map(str::to_owned)).unwrap();
+    let life = other.start("speaker", &arguments, configure).unwrap();
+    let speaker = LifecycleClient::new(&leader, "/speaker").unwrap();
+    speaker.wait(LIMIT).await.unwrap();
+    let parameters = leader
+        .service_client::<SetParameters>("/speaker/set_parameters")
+        .unwrap();
+    let mut said = leader.subscription::<Float64>("said", Qos::Event).unwrap();
+    let lead = |transition, from, to| speaker.lead(transition, from, to, LIMIT);
+    let ask = async |request| {
+        let options = CallOptions::default();
+        parameters
+            .call(&request, &options)
+            .await
+            .unwrap()
+            .results
+            .remove(0)
+    };
+
+    let refused = lead(Transition::Configure, State::Unconfigured, State::Inactive).await;
+    let refused = refused.unwrap_err().to_string();
+    assert_eq!(refused, "/speaker refuses to configure: it is unconfigured");
+    assert!(ask(set("period_ms", integer(10))).await.successful);
+    lead(Transition::Configure, State::Unconfigured, State::Inactive)
+        .await
+        .unwrap();
+    let fixed = ask(set("period_ms", integer(30))).await;
+    assert!(
+        fixed.reason.contains("clean the node up"),
+        "{}",
+        fixed.reason
+    );
+    tokio::time::sleep(Duration::from_millis(500)).await;
+    assert!(said.try_recv().is_none(), "speaks while it is inactive");
+
+    lead(Transition::Activate, State::Inactive, State::Active)
+        .await
+        .unwrap();
+    assert_eq!(timeout(LIMIT, said.recv()).await.unwrap().data, 0.5);
+    let louder = ParameterValue {
+        r#type: ParameterType::PARAMETER_DOUBLE,
+        double_value: 0.75,
+        ..ParameterValue::default()
+    };
+    assert!(ask(set("volume", louder)).await.successful);
+    timeout(LIMIT, async { while said.recv().await.data != 0.75 {} })
+        .await
+        .unwrap();
+    lead(Transition::Deactivate, State::Active, State::Inactive)
+        .await
+        .unwrap();
+    tokio::time::sleep(Duration::from_millis(300)).await;
+    while said.try_recv().is_some() {}
+    tokio::time::sleep(Duration::from_millis(300)).await;
+    assert!(said.try_recv().is_none(), "speaks while it is inactive");
+
+    // What fails at work ends the node.
+    lead(Transition::CleanUp, State::Inactive, State::Unconfigured)
+        .await
+        .unwrap();
+    assert!(ask(set("period_ms", integer(17))).await.successful);
+    lead(Transition::Configure, State::Unconfigured, State::Inactive)
+        .await
+        .unwrap();
+    lead(Transition::Activate, State::Inactive, State::Active)
+        .await
+        .unwrap();
+    let end = timeout(LIMIT, life).await.unwrap().unwrap();
+    assert_eq!(end.unwrap_err().to_string(), "17 fails");
 }

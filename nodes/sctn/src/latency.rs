@@ -1,7 +1,6 @@
 //! From the last camera frame to the proposal, over DDS through camera_fusion and gctn_policy.
 
 use crate::demos::demonstration;
-use crate::plain_node::NoParameters;
 use crate::root::Root;
 use anyhow::{Context as _, Result, bail};
 use gctn::{Compact, ModelCard, Network, NetworkConfig, Storage, Trainer, TrainingConfig};
@@ -9,7 +8,7 @@ use msgs::convert;
 use msgs::sctn_msgs::{Goal, PickPlace};
 use msgs::tf2_msgs::TFMessage;
 use multiravens::Environment;
-use node_kit::{Context, Node, Publisher, Qos, RosArguments, Subscription};
+use node_kit::{Context, NoParameters, Node, Publisher, Qos, RosArguments, Subscription};
 use sim_workcell::frames::{CameraTopics, Frame, camera_transforms};
 use std::time::{Duration, Instant};
 use tokio::runtime::Runtime;
@@ -94,7 +93,11 @@ impl Chain {
             "--params-file".into(),
             file("camera_fusion"),
         ];
-        context.start("camera_fusion", &arguments(&words)?, camera_fusion::run)?;
+        context.start(
+            "camera_fusion",
+            &arguments(&words)?,
+            camera_fusion::configure,
+        )?;
         let given = format!("checkpoint:={}", checkpoint.display());
         let words = [
             "--ros-args".to_owned(),
@@ -103,7 +106,7 @@ impl Chain {
             "-p".into(),
             given,
         ];
-        context.start("gctn_policy", &arguments(&words)?, gctn_policy::run)?;
+        context.start("gctn_policy", &arguments(&words)?, gctn_policy::configure)?;
 
         let (node, _) = context.node::<NoParameters>("sctn_bench", &RosArguments::default())?;
         let transforms = node.publisher::<TFMessage>("/tf_static", Qos::Latched)?;

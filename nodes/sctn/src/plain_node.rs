@@ -1,15 +1,7 @@
 //! A node without parameters of its own, for commands that join a graph.
 
 use anyhow::Result;
-use node_kit::{Context, Network, Node, Parameters, RosArguments};
-use serde::{Deserialize, Serialize};
-
-/// None but those that every node has.
-#[derive(Default, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-pub struct NoParameters {}
-
-impl Parameters for NoParameters {}
+use node_kit::{Context, Network, NoParameters, Node, RosArguments};
 
 /// Makes the node on a participant of its own; `arguments` as after `--ros-args`.
 pub fn plain_node(name: &str, arguments: &[String]) -> Result<(Context, Node)> {

@@ -4,14 +4,12 @@ use anyhow::{Context as _, Result, ensure};
 use msgs::sctn_msgs::{Goal, Heightmap, PickPlace, StepConfirmation, StepResult};
 use msgs::std_msgs::Bool;
 use msgs::ur_dashboard_msgs::{RobotMode, SafetyMode};
-use node_kit::{Context, Network, Parameters, Publisher, Qos, RosArguments, Subscription};
+use node_kit::{
+    AsBytes, Context, Network, NoParameters, Publisher, Qos, RosArguments, Subscription,
+};
 use rand::{Rng, RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
-use rustdds::{
-    DomainParticipantBuilder, QosPolicies, QosPolicyBuilder, RepresentationIdentifier, TopicKind,
-    bytes::Bytes, no_key, policy,
-};
-use serde::{Deserialize, Serialize};
+use rustdds::{DomainParticipantBuilder, QosPolicies, QosPolicyBuilder, TopicKind, policy};
 use std::collections::BTreeMap;
 use std::net::{IpAddr, Ipv4Addr};
 use std::path::{Path, PathBuf};
@@ -30,12 +28,6 @@ const VOLLEY: usize = 200;
 const PAUSE: Duration = Duration::from_millis(200);
 /// More memory than this, beyond what a node needed before, is a leak.
 const MOST_GROWTH_MB: u64 = 150;
-
-#[derive(Default, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-struct NoParameters {}
-
-impl Parameters for NoParameters {}
 
 fn root() -> PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("../..")
@@ -95,22 +87,6 @@ impl Drop for Running {
         for line in lines.iter().skip(lines.len().saturating_sub(6)) {
             println!("{}: {line}", self.name);
         }
-    }
-}
-
-/// Bytes as they are.
-#[derive(Clone)]
-struct AsBytes;
-
-impl no_key::SerializerAdapter<Vec<u8>> for AsBytes {
-    type Error = std::convert::Infallible;
-
-    fn output_encoding() -> RepresentationIdentifier {
-        RepresentationIdentifier::CDR_LE
-    }
-
-    fn to_bytes(value: &Vec<u8>) -> Result<Bytes, Self::Error> {
-        Ok(Bytes::copy_from_slice(value))
     }
 }
 

@@ -3,18 +3,11 @@
 use anyhow::{Context as _, Result};
 use bags::{BagWriter, Compression, Qos};
 use msgs::{Service, rosbag2_interfaces as services, std_msgs};
-use node_kit::{CallOptions, Context, Network, Node, Parameters, RosArguments, Subscription};
-use serde::{Deserialize, Serialize};
+use node_kit::{CallOptions, Context, Network, NoParameters, Node, RosArguments, Subscription};
 use std::process::{Child, Command, Stdio};
 use std::time::Duration;
 
 const DOMAIN: u16 = 51;
-
-#[derive(Default, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-struct NoParameters {}
-
-impl Parameters for NoParameters {}
 
 /// Killed when the test ends, however it ends.
 struct Player(Child);

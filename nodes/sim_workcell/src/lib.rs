@@ -10,5 +10,5 @@ mod node;
 mod parameters;
 mod workcell;
 
-pub use node::run;
+pub use node::{HardwareNode, configure};
 pub use parameters::SimWorkcellParameters;

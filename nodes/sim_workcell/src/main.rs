@@ -1,5 +1,5 @@
 //! The executable of the node.
 
 fn main() -> std::process::ExitCode {
-    node_kit::main("sim_workcell", sim_workcell::run)
+    node_kit::main("sim_workcell", sim_workcell::configure)
 }

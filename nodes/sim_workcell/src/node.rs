@@ -24,7 +24,7 @@ use msgs::ur_msgs::{
     FollowJointTrajectoryUntilResult, IOStates, SetIO, SetIORequest, SetIOResponse,
 };
 use multiravens::{MotionEnd, Problem};
-use node_kit::{Level, NewGoal, Node, Publisher, Qos, RunningGoal};
+use node_kit::{Active, Level, NewGoal, Node, Publisher, Qos, RunningGoal};
 use tokio::sync::oneshot;
 use tracing::{error, info, warn};
 use ur5::{JointTrajectory, WorkCell};
@@ -39,8 +39,11 @@ const WAITING_COMMANDS: usize = 64;
 /// Simulated time between feedback messages, as the driver's controllers have it.
 const FEEDBACK_PERIOD: Duration = Duration::from_millis(50);
 
-/// Runs the node until shutdown.
-pub async fn run(node: Node, parameters: SimWorkcellParameters) -> anyhow::Result<()> {
+/// Sets the episode up; what it returns poses as the hardware.
+pub async fn configure(
+    node: Node,
+    parameters: SimWorkcellParameters,
+) -> anyhow::Result<HardwareNode> {
     let problem = Problem::load(&parameters.problems_dir, &parameters.problem)?;
     let work_cell = match parameters.urdf.as_path() {
         path if path == Path::new("") => WorkCell::builtin(),
@@ -59,9 +62,10 @@ pub async fn run(node: Node, parameters: SimWorkcellParameters) -> anyhow::Resul
     .await
     .context("setting up the episode")??;
 
-    let mut follow = node.action_server::<FollowJointTrajectory>(&parameters.follow_action)?;
-    let mut until = node.action_server::<FollowJointTrajectoryUntil>(&parameters.until_action)?;
-    let mut set_io = node.service_server::<SetIO>("io_and_status_controller/set_io")?;
+    let (follow_action, until_action) = (
+        parameters.follow_action.clone(),
+        parameters.until_action.clone(),
+    );
     let (sender, commands) = mpsc::sync_channel(WAITING_COMMANDS);
     let stop = Arc::new(AtomicBool::new(false));
     let hardware = Hardware::new(
@@ -72,24 +76,58 @@ pub async fn run(node: Node, parameters: SimWorkcellParameters) -> anyhow::Resul
         commands,
         Arc::clone(&stop),
     )?;
-    let mut thread = node.spawn_blocking(move || hardware.run());
+    Ok(HardwareNode {
+        hardware: Some(hardware),
+        sender,
+        stop,
+        follow_action,
+        until_action,
+    })
+}
 
-    loop {
-        tokio::select! {
-            goal = follow.recv() => pass_on(&sender, Command::Follow(goal)),
-            goal = until.recv() => pass_on(&sender, Command::Until(goal)),
-            (id, request) = set_io.recv() => {
-                let (reply, replied) = oneshot::channel();
-                pass_on(&sender, Command::SetIo(request, reply));
-                // Dropped where the command was not taken.
-                let success = replied.await.unwrap_or(false);
-                set_io.respond(id, SetIOResponse { success });
-            }
-            ended = &mut thread => return ended.context("the hardware's thread panicked")?,
-            () = node.shutdown() => {
-                stop.store(true, Ordering::Release);
-                drop(sender);
-                return thread.await.context("the hardware's thread panicked")?;
+/// The configured node. While it is inactive the cell stays as it is, and nothing is said.
+pub struct HardwareNode {
+    /// Its thread has it while the node is active.
+    hardware: Option<Hardware>,
+    sender: mpsc::SyncSender<Command>,
+    stop: Arc<AtomicBool>,
+    follow_action: String,
+    until_action: String,
+}
+
+impl Active for HardwareNode {
+    async fn run(&mut self, node: &Node) -> anyhow::Result<()> {
+        let mut follow = node.action_server::<FollowJointTrajectory>(&self.follow_action)?;
+        let mut until = node.action_server::<FollowJointTrajectoryUntil>(&self.until_action)?;
+        let mut set_io = node.service_server::<SetIO>("io_and_status_controller/set_io")?;
+        let hardware = self.hardware.take();
+        let mut hardware = hardware.context("the hardware's thread has not ended")?;
+        self.stop.store(false, Ordering::Release);
+        let mut thread = node.spawn_blocking(move || {
+            let ended = hardware.run();
+            (hardware, ended)
+        });
+        let sender = &self.sender;
+        loop {
+            tokio::select! {
+                goal = follow.recv() => pass_on(sender, Command::Follow(goal)),
+                goal = until.recv() => pass_on(sender, Command::Until(goal)),
+                (id, request) = set_io.recv() => {
+                    let (reply, replied) = oneshot::channel();
+                    pass_on(sender, Command::SetIo(request, reply));
+                    // Dropped where the command was not taken.
+                    let success = replied.await.unwrap_or(false);
+                    set_io.respond(id, SetIOResponse { success });
+                }
+                ended = &mut thread => {
+                    return ended.context("the hardware's thread panicked")?.1;
+                }
+                () = node.deactivated() => {
+                    self.stop.store(true, Ordering::Release);
+                    let (hardware, ended) = thread.await.context("the hardware's thread panicked")?;
+                    self.hardware = Some(hardware);
+                    return ended;
+                }
             }
         }
     }
@@ -109,7 +147,7 @@ enum Command {
 }
 
 /// A goal that is being carried out.
-enum Active {
+enum Activity {
     Follow(RunningGoal<FollowJointTrajectory>),
     Until(RunningGoal<FollowJointTrajectoryUntil>),
 }
@@ -121,7 +159,7 @@ enum End {
     Cancelled,
 }
 
-impl Active {
+impl Activity {
     fn is_cancel_requested(&self) -> bool {
         match self {
             Self::Follow(goal) => goal.is_cancel_requested(),
@@ -293,7 +331,9 @@ impl Hardware {
         })
     }
 
-    fn run(mut self) -> anyhow::Result<()> {
+    fn run(&mut self) -> anyhow::Result<()> {
+        // What waited while nothing was active is refused.
+        while self.commands.try_recv().is_ok() {}
         let (problem, seed) = (&self.parameters.problem, self.parameters.seed);
         info!(
             "problem {problem}, seed {seed}: ready at {:?}",
@@ -301,6 +341,7 @@ impl Hardware {
         );
         self.look()?;
         while !self.stop.load(Ordering::Acquire) {
+            self.take_over();
             let next = self.next_status.min(self.next_pins).min(self.next_frames);
             match self
                 .commands
@@ -330,12 +371,12 @@ impl Hardware {
             Command::Follow(goal) => {
                 let (goal, running) = goal.accept();
                 let trajectory = follow_trajectory(&goal, arm, names);
-                self.carry_out(Active::Follow(running), trajectory, false)
+                self.carry_out(Activity::Follow(running), trajectory, false)
             }
             Command::Until(goal) => {
                 let (goal, running) = goal.accept();
                 let trajectory = until_trajectory(&goal, arm, names);
-                self.carry_out(Active::Until(running), trajectory, true)
+                self.carry_out(Activity::Until(running), trajectory, true)
             }
             Command::SetIo(request, reply) => {
                 self.set_io(&request, reply);
@@ -368,7 +409,7 @@ impl Hardware {
     /// Carries a goal out to its end.
     fn carry_out(
         &mut self,
-        goal: Active,
+        goal: Activity,
         trajectory: Result<JointTrajectory, Failure>,
         until_contact: bool,
     ) -> anyhow::Result<()> {
@@ -406,7 +447,7 @@ impl Hardware {
     }
 
     /// Steps the physics to the goal's end.
-    fn drive(&mut self, goal: &Active) -> anyhow::Result<End> {
+    fn drive(&mut self, goal: &Activity) -> anyhow::Result<End> {
         let begin = (Instant::now(), self.workcell.time());
         let rate_hz = self.parameters.joint_states_rate_hz;
         let tick_of = |time: Duration, rate_hz: f64| (time.as_secs_f64() * rate_hz) as u64;
@@ -444,6 +485,15 @@ impl Hardware {
             }
             self.pace(begin);
         }
+    }
+
+    /// The parameters that may be set at run time.
+    fn take_over(&mut self) {
+        self.parameters = self
+            .node
+            .parameters::<SimWorkcellParameters>()
+            .borrow()
+            .clone();
     }
 
     /// Waits where simulated time is to run no faster than a multiple of the wall clock's.
@@ -522,7 +572,7 @@ impl Hardware {
         }
     }
 
-    fn say_feedback(&self, goal: &Active, elapsed: Duration) -> anyhow::Result<()> {
+    fn say_feedback(&self, goal: &Activity, elapsed: Duration) -> anyhow::Result<()> {
         let point = JointTrajectoryPoint {
             positions: self.workcell.joints_rad().iter().copied().collect(),
             velocities: self.workcell.velocities_rad_s().iter().copied().collect(),

@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use node_kit::{InvalidParameter, Parameters};
+use node_kit::{Parameters, Range};
 use serde::{Deserialize, Serialize};
 
 /// Parameters of the node.
@@ -57,38 +57,25 @@ impl Default for SimWorkcellParameters {
     }
 }
 
+/// Times of the wall clock [s].
+const PERIOD: Range = Range::Float(0.001, 3600.0);
+/// Pins of the control box and the tool.
+const PIN: Range = Range::Integer(0, 17);
+
 impl Parameters for SimWorkcellParameters {
-    fn validate(&self) -> Result<(), InvalidParameter> {
-        for (name, pin) in [
-            ("suction_pin", self.suction_pin),
-            ("vacuum_pin", self.vacuum_pin),
-        ] {
-            if pin > 17 {
-                let reason = format!("must be 0 to 17, is {pin}");
-                return Err(InvalidParameter::new(name, reason));
-            }
-        }
-        if !(self.real_time_factor.is_finite() && self.real_time_factor >= 0.0) {
-            let reason = format!("must be 0 or more, is {}", self.real_time_factor);
-            return Err(InvalidParameter::new("real_time_factor", reason));
-        }
-        let rate = self.joint_states_rate_hz;
-        // Not a number is in no range.
-        if !(1.0..=480.0).contains(&rate) {
-            let reason = format!("must be 1 to 480, the rate of the physics, is {rate}");
-            return Err(InvalidParameter::new("joint_states_rate_hz", reason));
-        }
-        for (name, period) in [
-            ("status_period_s", self.status_period_s),
-            ("frames_period_s", self.frames_period_s),
-        ] {
-            if !(0.001..=3600.0).contains(&period) {
-                let reason = format!("must be 0.001 to 3600, is {period}");
-                return Err(InvalidParameter::new(name, reason));
-            }
-        }
-        Ok(())
-    }
+    const DOCUMENTATION: &'static str = include_str!("../../../config/sim_workcell.yaml");
+    const RANGES: &'static [(&'static str, Range)] = &[
+        ("seed", Range::Integer(0, i64::MAX)),
+        ("suction_pin", PIN),
+        ("vacuum_pin", PIN),
+        ("real_time_factor", Range::NOT_NEGATIVE),
+        // At most the rate of the physics.
+        ("joint_states_rate_hz", Range::Float(1.0, 480.0)),
+        ("status_period_s", PERIOD),
+        ("frames_period_s", PERIOD),
+    ];
+    const CHANGEABLE: &'static [&'static str] =
+        &["real_time_factor", "status_period_s", "frames_period_s"];
 }
 
 #[cfg(test)]
@@ -96,17 +83,9 @@ mod tests {
     use super::*;
 
     #[test]
-    fn the_configuration_file_shows_the_defaults() {
-        let file = include_str!("../../../config/sim_workcell.yaml");
-        let read: SimWorkcellParameters =
-            node_kit::load_text("config/sim_workcell.yaml", file, "/sim_workcell").unwrap();
-        assert_eq!(read, SimWorkcellParameters::default());
-        // And all of them.
-        let shown = serde_yaml_ng::to_value(&read).unwrap();
-        for name in shown.as_mapping().unwrap().keys() {
-            let name = format!("    {}:", name.as_str().unwrap());
-            assert!(file.contains(&name), "{name} is missing");
-        }
+    fn the_configuration_file_explains_every_parameter_and_shows_its_default() {
+        let mistakes = node_kit::mistakes_in_documentation::<SimWorkcellParameters>("sim_workcell");
+        assert_eq!(mistakes, [""; 0]);
     }
 
     #[test]

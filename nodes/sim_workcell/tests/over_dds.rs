@@ -14,20 +14,14 @@ use msgs::sensor_msgs::{Image, JointState};
 use msgs::ur_dashboard_msgs::{RobotMode, SafetyMode};
 use msgs::ur_msgs::{IOStates, SetIO, SetIORequest};
 use node_kit::{
-    CallError, CallOptions, Context, GoalStatus, Network, Node, Parameters, Qos, RosArguments,
+    CallError, CallOptions, Context, GoalStatus, Network, NoParameters, Node, Qos, RosArguments,
     Subscription,
 };
-use serde::{Deserialize, Serialize};
 use ur5::{JointTrajectory, Joints, TrajectoryPoint, WorkCell};
 
 const FOLLOW: &str = "scaled_joint_trajectory_controller/follow_joint_trajectory";
 const SET_IO: &str = "io_and_status_controller/set_io";
 const PATIENCE: Duration = Duration::from_secs(60);
-
-#[derive(Default, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-struct NoParameters {}
-impl Parameters for NoParameters {}
 
 /// A domain whose discovery ports nobody on this machine has.
 fn free_domain() -> u16 {
@@ -70,7 +64,7 @@ fn start(parameters: &[(&str, &str)]) -> (Context, Context, Node) {
         .unwrap();
     let sim = Context::new(network);
     let arguments = RosArguments::parse(line).unwrap().0;
-    sim.start("sim_workcell", &arguments, sim_workcell::run)
+    sim.start("sim_workcell", &arguments, sim_workcell::configure)
         .unwrap();
     (sim, own, node)
 }

@@ -172,6 +172,11 @@ impl Gate {
         }
     }
 
+    /// From the next confirmation on.
+    pub fn set_rules(&mut self, rules: Rules) {
+        self.rules = rules;
+    }
+
     /// The proposal that is being carried out.
     pub fn moving(&self) -> Option<u64> {
         self.moving

@@ -11,5 +11,5 @@ mod parameters;
 mod rehearsal;
 pub mod status;
 
-pub use node::run;
+pub use node::{ExecutorNode, configure};
 pub use parameters::{Driver, Limits, SuctionExecutorParameters};

@@ -1,5 +1,5 @@
 //! The executable of the node.
 
 fn main() -> std::process::ExitCode {
-    node_kit::main("suction_executor", suction_executor::run)
+    node_kit::main("suction_executor", suction_executor::configure)
 }

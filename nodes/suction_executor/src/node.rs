@@ -14,7 +14,7 @@ use msgs::std_msgs::Bool;
 use msgs::std_srvs::{Trigger, TriggerResponse};
 use msgs::ur_dashboard_msgs::{RobotMode, SafetyMode};
 use msgs::ur_msgs::{Digital, IOStates};
-use node_kit::{Level, Node, Publisher, Qos, RequestId, ServiceServer, Subscription};
+use node_kit::{Active, Level, Node, Publisher, Qos, RequestId, ServiceServer, Subscription};
 use pick_place::{ExecuteError, Outcome, Phase, PickPlace};
 use tokio::runtime::Handle;
 use tokio::sync::watch;
@@ -37,12 +37,15 @@ const WAITING_CALLS: usize = 16;
 /// Joints move less than this from one reading to the next while they stand still: the noise of
 /// encoders.
 const STILL_STEP_RAD: f64 = 1e-4;
-/// How long a motion may take to stop at shutdown.
-const SHUTDOWN_GRACE: Duration = Duration::from_millis(1500);
+/// How long a motion may take to stop when the node is deactivated.
+const STOP_GRACE: Duration = Duration::from_millis(1500);
 const DIAGNOSTICS_PERIOD: Duration = Duration::from_millis(500);
 
-/// Runs the node until shutdown.
-pub async fn run(node: Node, parameters: SuctionExecutorParameters) -> anyhow::Result<()> {
+/// Loads the work cell and listens to the driver; what it returns moves.
+pub async fn configure(
+    node: Node,
+    parameters: SuctionExecutorParameters,
+) -> anyhow::Result<ExecutorNode> {
     let work_cell = match parameters.urdf.as_path() {
         path if path == Path::new("") => WorkCell::builtin(),
         path => WorkCell::load(path),
@@ -57,33 +60,63 @@ pub async fn run(node: Node, parameters: SuctionExecutorParameters) -> anyhow::R
         status.clone(),
         origin,
     )?;
-    let rules = Rules {
+    Ok(ExecutorNode {
+        results: node.publisher("step_result", Qos::Event)?,
+        gate: Gate::new(rules(&parameters)),
+        automatic: !parameters.require_approval,
+        link: Arc::new(link),
+        work_cell,
+        status,
+        origin,
+    })
+}
+
+fn rules(parameters: &SuctionExecutorParameters) -> Rules {
+    Rules {
         frame: parameters.world_frame.clone(),
         workspace: Workspace::RAVENS,
         most: parameters.limits.settings(),
         observation_tolerance_m: parameters.observation_tolerance_m as f32,
         observation_changed_fraction: parameters.observation_changed_fraction,
         status_max_age: Duration::from_secs_f64(parameters.driver.status_max_age_s),
-    };
-    let executor = Executor {
-        proposals: node.subscription("pick_place", Qos::Latched)?,
-        confirmations: node.subscription("step_confirmation", Qos::Event)?,
-        heightmaps: node.subscription("heightmap", Qos::Latched)?,
-        results: node.publisher("step_result", Qos::Event)?,
-        home: node.service_server("~/home")?,
-        home_calls: Vec::new(),
-        gate: Gate::new(rules),
-        automatic: !parameters.require_approval,
-        waiting: VecDeque::new(),
-        motion: None,
-        link: Arc::new(link),
-        node,
-        parameters,
-        work_cell,
-        status,
-        origin,
-    };
-    executor.run().await
+    }
+}
+
+/// The configured node. What was used or stopped stays so while it is inactive.
+pub struct ExecutorNode {
+    results: Publisher<sctn_msgs::StepResult>,
+    gate: Gate,
+    /// Whether new proposals move by themselves.
+    automatic: bool,
+    link: Arc<Link>,
+    work_cell: WorkCell,
+    status: watch::Receiver<DriverStatus>,
+    origin: Instant,
+}
+
+impl Active for ExecutorNode {
+    async fn run(&mut self, node: &Node) -> anyhow::Result<()> {
+        let parameters = node.parameters::<SuctionExecutorParameters>();
+        let executor = Executor {
+            proposals: node.subscription("pick_place", Qos::Latched)?,
+            confirmations: node.subscription("step_confirmation", Qos::Event)?,
+            heightmaps: node.subscription("heightmap", Qos::Latched)?,
+            results: &self.results,
+            home: node.service_server("~/home")?,
+            home_calls: Vec::new(),
+            gate: &mut self.gate,
+            automatic: &mut self.automatic,
+            waiting: VecDeque::new(),
+            motion: None,
+            link: Arc::clone(&self.link),
+            node: node.clone(),
+            parameters: parameters.borrow().clone(),
+            work_cell: self.work_cell.clone(),
+            status: self.status.clone(),
+            origin: self.origin,
+        };
+        executor.run(parameters).await
+    }
 }
 
 /// Keeps the newest status of the driver.
@@ -180,20 +213,20 @@ struct Ended {
     stamps: Option<(Duration, Duration)>,
 }
 
-struct Executor {
+struct Executor<'a> {
     node: Node,
     parameters: SuctionExecutorParameters,
     work_cell: WorkCell,
     proposals: Subscription<sctn_msgs::PickPlace>,
     confirmations: Subscription<sctn_msgs::StepConfirmation>,
     heightmaps: Subscription<sctn_msgs::Heightmap>,
-    results: Publisher<sctn_msgs::StepResult>,
+    results: &'a Publisher<sctn_msgs::StepResult>,
     home: ServiceServer<Trigger>,
     /// Calls of `home` to be answered when the arm is there.
     home_calls: Vec<RequestId>,
-    gate: Gate,
+    gate: &'a mut Gate,
     /// Whether new proposals move by themselves.
-    automatic: bool,
+    automatic: &'a mut bool,
     waiting: VecDeque<Waiting>,
     motion: Option<Motion>,
     link: Arc<Link>,
@@ -201,8 +234,11 @@ struct Executor {
     origin: Instant,
 }
 
-impl Executor {
-    async fn run(mut self) -> anyhow::Result<()> {
+impl Executor<'_> {
+    async fn run(
+        mut self,
+        mut changes: watch::Receiver<SuctionExecutorParameters>,
+    ) -> anyhow::Result<()> {
         let node = self.node.clone();
         let mut diagnostics = tokio::time::interval(DIAGNOSTICS_PERIOD);
         loop {
@@ -215,17 +251,28 @@ impl Executor {
                 (cause, stopped, ended) = end_of(&mut self.motion) => self.on_end(cause, stopped, ended),
                 () = sleep_until(deadline) => self.ask_again(),
                 _ = diagnostics.tick() => self.diagnose(),
-                () = node.shutdown() => break,
+                Ok(()) = changes.changed() => {
+                    self.parameters = changes.borrow_and_update().clone();
+                    self.gate.set_rules(rules(&self.parameters));
+                }
+                () = node.deactivated() => break,
             }
         }
+        for call in std::mem::take(&mut self.home_calls) {
+            let response = TriggerResponse {
+                success: false,
+                message: "the executor is deactivated".to_owned(),
+            };
+            self.home.respond(call, response);
+        }
         if let Some(motion) = &self.motion {
-            warn!("shutting down while moving: stopping");
+            warn!("deactivated while moving: stopping");
             motion.stop.cancel();
-            if let Ok((cause, stopped, ended)) =
-                tokio::time::timeout(SHUTDOWN_GRACE, end_of(&mut self.motion)).await
-            {
-                self.on_end(cause, stopped, ended);
-            }
+            let (cause, stopped, ended) =
+                tokio::time::timeout(STOP_GRACE, end_of(&mut self.motion))
+                    .await
+                    .with_context(|| format!("the arm has not stopped after {STOP_GRACE:?}"))?;
+            self.on_end(cause, stopped, ended);
         }
         Ok(())
     }
@@ -254,14 +301,14 @@ impl Executor {
         match self.gate.propose(id, read_proposal(&message)) {
             Proposed::Open => {
                 info!("proposal {id}");
-                if self.automatic {
+                if *self.automatic {
                     self.confirm(id, Decision::Approve, None);
                 }
             }
             Proposed::Repeated => {}
             Proposed::Invalid(reason) => {
                 self.proposals.reject(&reason);
-                if self.automatic {
+                if *self.automatic {
                     self.report(id, sctn_msgs::StepResult::REFUSED, reason, None);
                 }
             }
@@ -313,7 +360,7 @@ impl Executor {
         use sctn_msgs::StepResult;
         if decision == Decision::Stop {
             // Nothing goes on by itself after a stop.
-            self.automatic = false;
+            *self.automatic = false;
             for waiting in std::mem::take(&mut self.waiting) {
                 let reason = format!("proposal {}: a stop came before it", waiting.id);
                 self.report(waiting.id, StepResult::REFUSED, reason, None);
@@ -330,7 +377,7 @@ impl Executor {
         match verdict {
             Verdict::Move(proposal) => {
                 // After a stop or a fault an approval lets things go on.
-                self.automatic = !self.parameters.require_approval;
+                *self.automatic = !self.parameters.require_approval;
                 self.begin(*proposal);
             }
             Verdict::Cancel => {
@@ -461,7 +508,7 @@ impl Executor {
         let broken_off = matches!(outcome, StepResult::STOPPED | StepResult::FAULT);
         if broken_off {
             // Nothing goes on by itself.
-            self.automatic = false;
+            *self.automatic = false;
             reason += "; the arm stands where it is, suction is as it was; a new observation and approval are needed";
         } else if stopped {
             reason = format!("the stop came after the end. {reason}")

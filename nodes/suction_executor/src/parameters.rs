@@ -2,7 +2,7 @@
 
 use std::path::PathBuf;
 
-use node_kit::{InvalidParameter, Parameters};
+use node_kit::{Parameters, Range};
 use pick_place::PrimitiveSettings;
 use serde::{Deserialize, Serialize};
 
@@ -141,95 +141,59 @@ impl Limits {
     }
 }
 
+/// Times of the wall clock [s].
+const TIME: Range = Range::Float(0.001, 3600.0);
+/// Pins of the control box and the tool.
+const PIN: Range = Range::Integer(0, 17);
+
 impl Parameters for SuctionExecutorParameters {
-    fn validate(&self) -> Result<(), InvalidParameter> {
-        let Limits {
-            clearance_m,
-            lift_m,
-            travel_m_s,
-            carry_m_s,
-            descend_m_s,
-            acceleration_m_s2,
-        } = self.limits;
-        let driver = &self.driver;
-        for (name, value) in [
-            ("limits.clearance_m", clearance_m),
-            ("limits.lift_m", lift_m),
-            ("limits.travel_m_s", travel_m_s),
-            ("limits.carry_m_s", carry_m_s),
-            ("limits.descend_m_s", descend_m_s),
-            ("limits.acceleration_m_s2", acceleration_m_s2),
-            ("observation_tolerance_m", self.observation_tolerance_m),
-            ("driver.rest_speed_rad_s", driver.rest_speed_rad_s),
-            ("driver.path_tolerance_rad", driver.path_tolerance_rad),
-            ("driver.goal_tolerance_rad", driver.goal_tolerance_rad),
-            ("driver.motion_time_factor", driver.motion_time_factor),
-        ] {
-            InvalidParameter::unless_positive(name, value)?;
-        }
-        for (name, value) in [
-            ("confirmation_grace_s", self.confirmation_grace_s),
-            ("driver.status_max_age_s", driver.status_max_age_s),
-            ("driver.reading_timeout_s", driver.reading_timeout_s),
-            ("driver.rest_time_s", driver.rest_time_s),
-            ("driver.motion_time_margin_s", driver.motion_time_margin_s),
-            ("driver.call_timeout_s", driver.call_timeout_s),
-        ] {
-            // Not a number is in no range.
-            if !(0.001..=3600.0).contains(&value) {
-                let reason = format!("must be 0.001 to 3600, is {value}");
-                return Err(InvalidParameter::new(name, reason));
-            }
-        }
-        if !(0.0..=1.0).contains(&self.observation_changed_fraction) {
-            let reason = format!("must be 0 to 1, is {}", self.observation_changed_fraction);
-            return Err(InvalidParameter::new(
-                "observation_changed_fraction",
-                reason,
-            ));
-        }
-        for (name, pin) in [
-            ("driver.suction_pin", driver.suction_pin),
-            ("driver.vacuum_pin", driver.vacuum_pin),
-        ] {
-            if pin > 17 {
-                let reason = format!("must be 0 to 17, is {pin}");
-                return Err(InvalidParameter::new(name, reason));
-            }
-        }
-        if !(1..=100).contains(&driver.call_attempts) {
-            let reason = format!("must be 1 to 100, is {}", driver.call_attempts);
-            return Err(InvalidParameter::new("driver.call_attempts", reason));
-        }
-        Ok(())
-    }
+    const DOCUMENTATION: &'static str = include_str!("../../../config/suction_executor.yaml");
+    const RANGES: &'static [(&'static str, Range)] = &[
+        ("limits.clearance_m", Range::POSITIVE),
+        ("limits.lift_m", Range::POSITIVE),
+        ("limits.travel_m_s", Range::POSITIVE),
+        ("limits.carry_m_s", Range::POSITIVE),
+        ("limits.descend_m_s", Range::POSITIVE),
+        ("limits.acceleration_m_s2", Range::POSITIVE),
+        ("observation_tolerance_m", Range::POSITIVE),
+        ("observation_changed_fraction", Range::SHARE),
+        ("confirmation_grace_s", TIME),
+        ("driver.suction_pin", PIN),
+        ("driver.vacuum_pin", PIN),
+        ("driver.status_max_age_s", TIME),
+        ("driver.reading_timeout_s", TIME),
+        ("driver.rest_speed_rad_s", Range::POSITIVE),
+        ("driver.rest_time_s", TIME),
+        ("driver.path_tolerance_rad", Range::POSITIVE),
+        ("driver.goal_tolerance_rad", Range::POSITIVE),
+        ("driver.motion_time_factor", Range::POSITIVE),
+        ("driver.motion_time_margin_s", TIME),
+        ("driver.call_timeout_s", TIME),
+        ("driver.call_attempts", Range::Integer(1, 100)),
+    ];
+    // What needs an approval is not for the network to change while the arm may move.
+    const CHANGEABLE: &'static [&'static str] = &[
+        "limits.clearance_m",
+        "limits.lift_m",
+        "limits.travel_m_s",
+        "limits.carry_m_s",
+        "limits.descend_m_s",
+        "limits.acceleration_m_s2",
+        "observation_tolerance_m",
+        "observation_changed_fraction",
+        "confirmation_grace_s",
+    ];
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    fn lines(prefix: &str, value: &serde_yaml_ng::Value, out: &mut Vec<String>) {
-        for (name, value) in value.as_mapping().unwrap() {
-            out.push(format!("{prefix}{}:", name.as_str().unwrap()));
-            if value.is_mapping() {
-                lines(&format!("{prefix}  "), value, out);
-            }
-        }
-    }
-
     #[test]
-    fn the_configuration_file_shows_the_defaults() {
-        let file = include_str!("../../../config/suction_executor.yaml");
-        let read: SuctionExecutorParameters =
-            node_kit::load_text("config/suction_executor.yaml", file, "/suction_executor").unwrap();
-        assert_eq!(read, SuctionExecutorParameters::default());
-        // And all of them.
-        let mut names = Vec::new();
-        lines("    ", &serde_yaml_ng::to_value(&read).unwrap(), &mut names);
-        for name in names {
-            assert!(file.contains(&name), "{name} is missing");
-        }
+    fn the_configuration_file_explains_every_parameter_and_shows_its_default() {
+        let mistakes =
+            node_kit::mistakes_in_documentation::<SuctionExecutorParameters>("suction_executor");
+        assert_eq!(mistakes, [""; 0]);
     }
 
     #[test]

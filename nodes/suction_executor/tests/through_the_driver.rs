@@ -18,10 +18,10 @@ use msgs::ur_dashboard_msgs::SafetyMode;
 use multiravens::{Environment, Problem};
 use nalgebra::{Isometry2, Isometry3, Vector2};
 use node_kit::{
-    CallOptions, Context, Network, Node, Parameters, Publisher, Qos, RosArguments, Subscription,
+    CallOptions, Context, LifecycleClient, Network, NoParameters, Node, Publisher, Qos,
+    RosArguments, State, Subscription, Transition,
 };
 use pick_place::{PickPlace, PrimitiveSettings};
-use serde::{Deserialize, Serialize};
 use ur5::WorkCell;
 
 const SEED: u64 = 10_000;
@@ -46,11 +46,6 @@ fn free_domain() -> u16 {
         })
         .expect("a free domain")
 }
-
-#[derive(Default, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-struct NoParameters {}
-impl Parameters for NoParameters {}
 
 fn arguments(parameters: &[(&str, String)]) -> RosArguments {
     let mut line = vec!["--ros-args".to_owned()];
@@ -146,14 +141,18 @@ impl Bench {
         ];
         bench
             .sim
-            .start("sim_workcell", &common(&scene, sim), sim_workcell::run)
+            .start(
+                "sim_workcell",
+                &common(&scene, sim),
+                sim_workcell::configure,
+            )
             .unwrap();
         bench
             .executor
             .start(
                 "suction_executor",
                 &common(&[], executor),
-                suction_executor::run,
+                suction_executor::configure,
             )
             .unwrap();
         let graph = bench.node.graph();
@@ -485,6 +484,63 @@ async fn a_stop_stops_the_arm_and_it_goes_on_neither_by_itself_nor_on_the_old_ap
     bench.propose(2, time, &action, &environment.settings().unwrap());
     bench.decide(2, StepConfirmation::APPROVE);
     bench.until_moving().await;
+    bench.stop().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn deactivating_during_a_motion_stops_the_arm_and_nothing_moves_until_a_new_approval() {
+    let (mut bench, ..) = proposed(&slow(), &[]).await;
+    let executor = LifecycleClient::new(&bench.node, "/suction_executor").unwrap();
+    executor.wait(PATIENCE).await.unwrap();
+    bench.decide(1, StepConfirmation::APPROVE);
+    bench.until_moving().await;
+    executor
+        .lead(
+            Transition::Deactivate,
+            State::Active,
+            State::Inactive,
+            PATIENCE,
+        )
+        .await
+        .unwrap();
+    let result = bench.result().await;
+    assert_eq!(
+        (result.proposal_id, result.outcome),
+        (1, StepResult::STOPPED),
+        "{}",
+        result.reason
+    );
+    let stopped = bench.joints().await;
+    // Nobody hears this.
+    bench.decide(1, StepConfirmation::APPROVE);
+    tokio::time::sleep(Duration::from_secs(1)).await;
+    assert_eq!(bench.joints().await.position, stopped.position);
+    executor
+        .lead(
+            Transition::Activate,
+            State::Inactive,
+            State::Active,
+            PATIENCE,
+        )
+        .await
+        .unwrap();
+    assert!(
+        bench
+            .node
+            .graph()
+            .wait_for_subscription(bench.confirmations.topic(), PATIENCE)
+            .await
+    );
+    tokio::time::sleep(Duration::from_secs(1)).await;
+    bench.decide(1, StepConfirmation::APPROVE);
+    let result = bench.result().await;
+    assert_eq!(result.outcome, StepResult::REFUSED, "{}", result.reason);
+    assert!(
+        result.reason.contains("already carried out"),
+        "{}",
+        result.reason
+    );
+    assert_eq!(bench.joints().await.position, stopped.position);
     bench.stop().await;
 }
 

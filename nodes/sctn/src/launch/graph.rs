@@ -2,9 +2,10 @@
 
 use crate::root::Root;
 use anyhow::{Context as _, Result, bail};
-use node_kit::{Context, RosArguments};
+use node_kit::{Context, LifecycleClient, LifecycleError, Node, RosArguments, State, Transition};
 use std::path::{Path, PathBuf};
 use std::process::{ExitStatus, Stdio};
+use std::time::Duration;
 use tokio::process::{Child, Command};
 use tokio::task::JoinHandle;
 
@@ -22,13 +23,17 @@ pub struct Settings {
     pub operated: bool,
 }
 
+/// In the order in which they go to work: the first goal comes when all others are there.
 const NODES: [&str; 5] = [
     "sim_workcell",
     "camera_fusion",
-    "goal_oracle",
     "gctn_policy",
     "suction_executor",
+    "goal_oracle",
 ];
+
+/// How long a node may take to appear, and for each transition: the policy loads its network.
+const BRING_UP: Duration = Duration::from_secs(30);
 
 impl Settings {
     fn parameters(&self, root: &Root, node: &str) -> Vec<(&'static str, String)> {
@@ -64,10 +69,10 @@ impl Settings {
             file.display().to_string(),
         ];
         let parameters = self.parameters(root, node);
-        for (name, value) in parameters
-            .iter()
-            .chain([&("use_sim_time", "true".to_owned())])
-        {
+        for (name, value) in parameters.iter().chain([
+            &("use_sim_time", "true".to_owned()),
+            &("autostart", "false".to_owned()),
+        ]) {
             arguments.extend(["-p".to_owned(), format!("{name}:={value}")]);
         }
         arguments
@@ -84,17 +89,17 @@ pub enum Graph {
 }
 
 impl Graph {
-    /// All nodes in this process, on one participant.
+    /// All nodes in this process.
     pub fn compose(root: &Root, settings: &Settings, context: &Context) -> Result<Self> {
         let mut tasks = Vec::new();
         for node in NODES {
             let (arguments, _) = RosArguments::parse(settings.arguments(root, node))?;
             let task = match node {
-                "sim_workcell" => context.start(node, &arguments, sim_workcell::run),
-                "camera_fusion" => context.start(node, &arguments, camera_fusion::run),
-                "goal_oracle" => context.start(node, &arguments, goal_oracle::run),
-                "gctn_policy" => context.start(node, &arguments, gctn_policy::run),
-                _ => context.start(node, &arguments, suction_executor::run),
+                "sim_workcell" => context.start(node, &arguments, sim_workcell::configure),
+                "camera_fusion" => context.start(node, &arguments, camera_fusion::configure),
+                "goal_oracle" => context.start(node, &arguments, goal_oracle::configure),
+                "gctn_policy" => context.start(node, &arguments, gctn_policy::configure),
+                _ => context.start(node, &arguments, suction_executor::configure),
             };
             tasks.push((node, task?));
         }
@@ -134,6 +139,40 @@ impl Graph {
         })
     }
 
+    /// Configures all nodes, then activates one after the other, and waits until `listeners` hear what the operator
+    /// says. `node` asks them to.
+    pub async fn bring_up(&mut self, node: &Node, listeners: usize) -> Result<()> {
+        let bringing_up = async {
+            let led = NODES.map(|name| async move {
+                let client = LifecycleClient::new(node, &node.resolve(name))?;
+                client.wait(BRING_UP).await?;
+                let (from, to) = (State::Unconfigured, State::Inactive);
+                client
+                    .lead(Transition::Configure, from, to, BRING_UP)
+                    .await?;
+                anyhow::Ok(client)
+            });
+            for client in futures::future::try_join_all(led).await? {
+                let (from, to) = (State::Inactive, State::Active);
+                client
+                    .lead(Transition::Activate, from, to, BRING_UP)
+                    .await?;
+            }
+            anyhow::Ok(())
+        };
+        let brought_up = tokio::select! {
+            error = self.failure() => return Err(error),
+            brought_up = bringing_up => brought_up,
+        };
+        brought_up.map_err(|error| match (self, error.downcast_ref()) {
+            (Self::Processes { logs, .. }, Some(LifecycleError::Refused { node, .. })) => {
+                let said = last_words(logs, node.trim_start_matches('/'));
+                error.context(said)
+            }
+            _ => error,
+        })
+    }
+
     /// Waits until a node ends, which none should while a run lasts; says which and why.
     pub async fn failure(&mut self) -> anyhow::Error {
         match self {
@@ -153,19 +192,11 @@ impl Graph {
                     .iter_mut()
                     .map(|(node, child)| Box::pin(async move { (*node, child.wait().await) }));
                 let ((node, status), _, _) = futures::future::select_all(ends).await;
-                let log = logs.join(format!("{node}.log"));
-                let text = std::fs::read_to_string(&log).unwrap_or_default();
-                let mut last: Vec<_> = text.lines().rev().take(5).collect();
-                last.reverse();
                 let status = status.map_or_else(
                     |error| error.to_string(),
                     |status: ExitStatus| status.to_string(),
                 );
-                anyhow::anyhow!(
-                    "{node} ended ({status}), see {}:\n{}",
-                    log.display(),
-                    last.join("\n")
-                )
+                anyhow::anyhow!("{node} ended ({status}), {}", last_words(logs, node))
             }
         }
     }
@@ -192,7 +223,7 @@ impl Graph {
                     }
                 }
                 for (node, child) in &mut children {
-                    let grace = std::time::Duration::from_secs(4);
+                    let grace = Duration::from_secs(4);
                     if tokio::time::timeout(grace, child.wait()).await.is_err() {
                         tracing::warn!("{node} did not end on SIGTERM: killed");
                         let _ = child.kill().await;
@@ -201,4 +232,13 @@ impl Graph {
             }
         }
     }
+}
+
+/// The end of a process's log.
+fn last_words(logs: &Path, node: &str) -> String {
+    let log = logs.join(format!("{node}.log"));
+    let text = std::fs::read_to_string(&log).unwrap_or_default();
+    let mut last: Vec<_> = text.lines().rev().take(5).collect();
+    last.reverse();
+    format!("see {}:\n{}", log.display(), last.join("\n"))
 }

@@ -172,9 +172,17 @@ impl Launch {
         } else {
             Graph::compose(root, settings, &context)?
         };
+        let run = async {
+            // Policy, executor and oracle hear the operator, and so does the recorder.
+            let listeners = 3 + usize::from(recorder.is_some());
+            graph.bring_up(&node, listeners).await?;
+            tokio::select! {
+                ended = desk.work(self.operator, max_steps) => ended,
+                error = graph.failure() => Err(error),
+            }
+        };
         let ended = tokio::select! {
-            ended = desk.work(self.operator, max_steps) => ended,
-            error = graph.failure() => Err(error),
+            ended = run => ended,
             result = wait_for_end() => result.and(Err(anyhow::anyhow!("stopped by a signal"))),
         };
         if let Some(recorder) = &recorder {

@@ -1,0 +1,191 @@
+//! Gives back every message of `msgs`, and services: the peer of the tests with rclpy (docs/ros2.md).
+//!
+//! - Messages: what comes on `echo/PACKAGE/NAME` goes out on `echoed/PACKAGE/NAME`; `latched` to `latched_echoed`.
+//! - Services: `served/PACKAGE/NAME` says on `asked/..` what it was asked and answers what came on `reply/..`; what comes on
+//!   `ask/..` is asked of `answer/..`, and its answer goes out on `answered/..`.
+
+use std::{
+    process::ExitCode,
+    sync::{Arc, Mutex, PoisonError},
+};
+
+use msgs::{
+    CdrError, Interface, Service, Visitor, from_cdr,
+    rcl_interfaces::{GetParameters, SetParameters},
+    sctn_msgs::Reward,
+    to_cdr,
+};
+use node_kit::{
+    Active, CallOptions, NoParameters, Node, NodeError, Qos, RawPublisher, RawQos, RawSubscription,
+};
+use tracing::warn;
+
+const RELIABLE: RawQos = RawQos {
+    reliable: true,
+    transient_local: false,
+    depth: 64,
+};
+
+fn main() -> ExitCode {
+    node_kit::main("interface_echo", configure)
+}
+
+async fn configure(_: Node, _: NoParameters) -> anyhow::Result<Echo> {
+    Ok(Echo)
+}
+
+struct Echo;
+
+impl Active for Echo {
+    async fn run(&mut self, node: &Node) -> anyhow::Result<()> {
+        let mut messages = Messages(Vec::new());
+        msgs::visit_all(&mut messages);
+        for (type_name, again) in messages.0 {
+            echo(node, type_name, again)?;
+        }
+        service::<GetParameters>(node)?;
+        service::<SetParameters>(node)?;
+        echo_latched(node)?;
+        node.deactivated().await;
+        Ok(())
+    }
+}
+
+/// Reads a message and writes it again.
+type Again = fn(&[u8]) -> Result<Vec<u8>, CdrError>;
+
+/// All messages: their type names, and how to read and write them.
+struct Messages(Vec<(&'static str, Again)>);
+
+impl Visitor for Messages {
+    fn visit<T: Interface>(&mut self) {
+        if T::TYPE_NAME.contains("/msg/") {
+            let again: Again = |cdr| to_cdr(&from_cdr::<T>(cdr)?);
+            self.0.push((T::TYPE_NAME, again));
+        }
+    }
+}
+
+fn echo(node: &Node, type_name: &str, again: Again) -> Result<(), NodeError> {
+    let name = type_name.replace("/msg/", "/");
+    let mut subscription = node.raw_subscription(&format!("echo/{name}"), type_name, RELIABLE)?;
+    let publisher = node.raw_publisher(&format!("echoed/{name}"), type_name, RELIABLE)?;
+    node.spawn(async move {
+        loop {
+            match again(&subscription.recv().await.data) {
+                Ok(cdr) => {
+                    publisher.publish(cdr);
+                }
+                Err(error) => warn!("{}: {error}", subscription.topic()),
+            }
+        }
+    });
+    Ok(())
+}
+
+fn echo_latched(node: &Node) -> Result<(), NodeError> {
+    let mut subscription = node.subscription::<Reward>("latched", Qos::Latched)?;
+    let publisher = node.publisher::<Reward>("latched_echoed", Qos::Latched)?;
+    node.spawn(async move {
+        loop {
+            publisher.publish(subscription.recv().await);
+        }
+    });
+    Ok(())
+}
+
+fn service<S: Service + 'static>(node: &Node) -> Result<(), NodeError> {
+    serve::<S>(node)?;
+    call::<S>(node)
+}
+
+/// The part of a service or action that came last on a topic.
+struct Given<T>(Arc<Mutex<T>>);
+
+impl<T: Interface> Given<T> {
+    fn on(node: &Node, topic: &str) -> Result<Self, NodeError> {
+        let newest = Arc::new(Mutex::new(T::default()));
+        let mut parts = Parts::<T>::on(node, topic)?;
+        let shared = Arc::clone(&newest);
+        node.spawn(async move {
+            loop {
+                let given = parts.recv().await;
+                *shared.lock().unwrap_or_else(PoisonError::into_inner) = given;
+            }
+        });
+        Ok(Self(newest))
+    }
+
+    fn newest(&self) -> T {
+        self.0
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner)
+            .clone()
+    }
+}
+
+/// Parts of services and actions as messages.
+struct Parts<T> {
+    subscription: RawSubscription,
+    part: std::marker::PhantomData<T>,
+}
+
+impl<T: Interface> Parts<T> {
+    fn on(node: &Node, topic: &str) -> Result<Self, NodeError> {
+        Ok(Self {
+            subscription: node.raw_subscription(topic, T::TYPE_NAME, RELIABLE)?,
+            part: std::marker::PhantomData,
+        })
+    }
+
+    async fn recv(&mut self) -> T {
+        loop {
+            match from_cdr(&self.subscription.recv().await.data) {
+                Ok(part) => return part,
+                Err(error) => warn!("{}: {error}", self.subscription.topic()),
+            }
+        }
+    }
+}
+
+fn say<T: Interface>(publisher: &RawPublisher, part: &T) {
+    match to_cdr(part) {
+        Ok(cdr) => {
+            publisher.publish(cdr);
+        }
+        Err(error) => warn!("{}: {error}", publisher.topic()),
+    }
+}
+
+fn publisher<T: Interface>(node: &Node, topic: &str) -> Result<RawPublisher, NodeError> {
+    node.raw_publisher(topic, T::TYPE_NAME, RELIABLE)
+}
+
+fn serve<S: Service + 'static>(node: &Node) -> Result<(), NodeError> {
+    let name = format!("{}/{}", S::PACKAGE, S::NAME);
+    let server = node.service_server::<S>(&format!("served/{name}"))?;
+    let asked = publisher::<S::Request>(node, &format!("asked/{name}"))?;
+    let reply = Given::<S::Response>::on(node, &format!("reply/{name}"))?;
+    node.spawn(server.serve(move |request| {
+        say(&asked, &request);
+        reply.newest()
+    }));
+    Ok(())
+}
+
+fn call<S: Service + 'static>(node: &Node) -> Result<(), NodeError> {
+    let name = format!("{}/{}", S::PACKAGE, S::NAME);
+    let mut asks = Parts::<S::Request>::on(node, &format!("ask/{name}"))?;
+    let client = node.service_client::<S>(&format!("answer/{name}"))?;
+    let answered = publisher::<S::Response>(node, &format!("answered/{name}"))?;
+    node.spawn(async move {
+        loop {
+            let request = asks.recv().await;
+            match client.call(&request, &CallOptions::default()).await {
+                Ok(response) => say(&answered, &response),
+                Err(error) => warn!("{error}"),
+            }
+        }
+    });
+    Ok(())
+}

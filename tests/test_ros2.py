@@ -29,7 +29,7 @@ from rcl_interfaces.srv import (
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
 from sctn_msgs.msg import Heightmap, Reward
-from sensor_msgs.msg import Image
+from sensor_msgs.msg import CameraInfo
 
 from peer import BEST_EFFORT, LATCHED, RELIABLE, Peer, filled, interfaces
 from processes import REPOSITORY, Process
@@ -52,7 +52,7 @@ def echo(start_for_module, peer: Peer) -> Process:
 
 
 def wait_for_node(peer: Peer, name: str, namespace: str = "/") -> None:
-    peer.until(lambda: (name, namespace) in peer.node.get_node_names_and_namespaces(), f"node {name}")
+    peer.until(lambda: (name, namespace) in peer.node.get_node_names_and_namespaces(), f"node {name}", 45.0)
 
 
 # --- messages, services, actions
@@ -124,9 +124,11 @@ def test_a_service_answers_many_calls_at_once_and_the_first_one_too(echo: Proces
         with Peer(domain, f"caller_{number}") as caller:
             # Each peer is new to the server: the reply to a first call must not be lost.
             client = caller.client(kind, "served/rcl_interfaces/GetParameters")
-            futures = [client.call_async(kind.Request(names=[str(call)])) for call in range(20)]
-            for future in futures:
-                caller.wait(future, "answer of each call", 10.0)
+            for _ in range(3):
+                # rclpy keeps ten answers.
+                futures = [client.call_async(kind.Request(names=[str(call)])) for call in range(8)]
+                for future in futures:
+                    caller.wait(future, "answer of each call", 10.0)
 
 
 # --- latched topics, restarts, names
@@ -207,17 +209,24 @@ def test_rclpy_sees_names_types_and_qos_of_the_graph(start, peer: Peer) -> None:
     start("camera_fusion", "--ros-args", "-r", "__ns:=/seen")
     wait_for_node(peer, "camera_fusion", "/seen")
     node = peer.node
-    offered = peer.until(lambda: node.get_publishers_info_by_topic("/seen/heightmap"), "publisher of the heightmap")
-    (heightmap,) = offered
-    assert (heightmap.node_name, heightmap.node_namespace) == ("camera_fusion", "/seen")
+
+    def offered() -> Any:
+        # Names come after endpoints.
+        found = node.get_publishers_info_by_topic("/seen/heightmap")
+        return next((one for one in found if (one.node_name, one.node_namespace) == ("camera_fusion", "/seen")), None)
+
+    heightmap = peer.until(offered, "publisher of the heightmap")
     assert heightmap.topic_type == "sctn_msgs/msg/Heightmap"
     assert heightmap.qos_profile.reliability == ReliabilityPolicy.RELIABLE
     assert heightmap.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL
     wanted = peer.until(lambda: node.get_subscriptions_info_by_topic("/seen/front/color/image_raw"), "image subscription")
     assert wanted[0].topic_type == "sensor_msgs/msg/Image"
     assert wanted[0].qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT
-    published = dict(node.get_publisher_names_and_types_by_node("camera_fusion", "/seen"))
-    assert published["/seen/heightmap"] == ["sctn_msgs/msg/Heightmap"]
+    def published() -> Any:
+        return dict(node.get_publisher_names_and_types_by_node("camera_fusion", "/seen"))
+
+    peer.until(lambda: "/seen/heightmap" in published(), "names of topics")
+    assert published()["/seen/heightmap"] == ["sctn_msgs/msg/Heightmap"]
     services = dict(node.get_service_names_and_types_by_node("camera_fusion", "/seen"))
     assert services["/seen/camera_fusion/change_state"] == ["lifecycle_msgs/srv/ChangeState"]
 
@@ -443,7 +452,8 @@ def test_logs_come_on_rosout_at_the_level_that_was_asked_for(start, peer: Peer) 
             peer.call(SetParameters, f"{namespace}/camera_fusion/set_parameters", request)
         time.sleep(0.1)
         said = [log for log in logs if log.name == "loud.camera_fusion" and "no_such_parameter" in log.msg]
-        return bool(said) and said[0].level == int.from_bytes(Log.INFO, "little")
+        # A byte in one distribution, a number in another.
+        return bool(said) and said[0].level in (Log.INFO, *bytes([20]))
 
     peer.until(spoken, "log")
     assert not [log for log in logs if log.name == "quiet.camera_fusion"]
@@ -453,18 +463,18 @@ def test_diagnostics_tell_rates_ages_drops_and_the_last_error(start, peer: Peer)
     start("camera_fusion", "--ros-args", "-r", "__ns:=/ill")
     wait_for_node(peer, "camera_fusion", "/ill")
     arrays = peer.listen(DiagnosticArray, "/diagnostics")
-    images = peer.speak(Image, "/ill/front/color/image_raw", BEST_EFFORT)
+    topic = "/ill/front/color/camera_info"
+    calibrations = peer.speak(CameraInfo, topic, BEST_EFFORT)
 
     def told() -> bool:
-        images.publish(Image(encoding="no such encoding"))
+        # Of a camera without size and focal length.
+        calibrations.publish(CameraInfo())
         time.sleep(0.1)
         topics = [status for array in arrays for status in array.status if status.name == "/ill/camera_fusion: topics"]
         values = {one.key: one.value for one in topics[-1].values} if topics else {}
-        line = values.get("/ill/front/color/image_raw", "")
+        line = values.get(topic, "")
         counts = re.fullmatch(r"in messages=(\d+) rate_hz=([\d.]+) age_s=([\d.]+) dropped=(\d+) errors=(\d+)", line)
-        return bool(counts) and int(counts[5]) > 0 and float(counts[2]) > 1 and "encoding" in values.get(
-            "/ill/front/color/image_raw last_error", ""
-        )
+        return bool(counts) and int(counts[5]) > 0 and float(counts[2]) > 1 and bool(values.get(f"{topic} last_error"))
 
     peer.until(told, "diagnostics of the topic")
     states = {status.name: status.message for array in arrays for status in array.status}

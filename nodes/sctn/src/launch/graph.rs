@@ -158,7 +158,15 @@ impl Graph {
                     .lead(Transition::Activate, from, to, BRING_UP)
                     .await?;
             }
-            anyhow::Ok(())
+            let (graph, topic) = (node.graph(), node.resolve("step_confirmation"));
+            let heard = async {
+                while graph.subscriptions(&topic) < listeners {
+                    tokio::time::sleep(Duration::from_millis(20)).await;
+                }
+            };
+            tokio::time::timeout(BRING_UP, heard)
+                .await
+                .with_context(|| format!("{topic}: fewer than {listeners} nodes listen"))
         };
         let brought_up = tokio::select! {
             error = self.failure() => return Err(error),

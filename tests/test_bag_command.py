@@ -64,7 +64,7 @@ def test_a_bag_of_rosbags_is_listed(start, tmp_path: pathlib.Path, kind: str) ->
     assert (topic["name"], topic["type"], topic["messages"], topic["has_definition"]) == ("/scan", SCAN, 50, True)
 
 
-@pytest.mark.parametrize("kind", ["mcap", "mcap zstd", "sqlite"])
+@pytest.mark.parametrize("kind", KINDS)
 def test_a_bag_of_rosbags_is_copied_message_by_message(start, tmp_path: pathlib.Path, kind: str) -> None:
     write_scans(tmp_path / "bag", kind)
     assert bag_command(start, "verify", tmp_path / "bag")[0] == WHOLE

@@ -11,12 +11,14 @@ import subprocess
 import sys
 
 import numpy as np
+import pyarrow as pa
 import pyarrow.parquet
 import pytest
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 
+from bag_contents import same
 from processes import REPOSITORY
 
 
@@ -50,10 +52,18 @@ def test_an_exported_run_is_what_the_bag_says(start, run: pathlib.Path, tmp_path
     export = start("sctn", "bag", "export", run / "run", run / "demonstration", "--out", out, "--json")
     assert export.wait(60.0) == 0, export.log()
     info = json.loads((out / "meta/info.json").read_text())
-    episodes = [json.loads(line) for line in (out / "meta/episodes.jsonl").read_text().splitlines()]
+    assert info["codebase_version"] == "v3.0"
+    episodes = pyarrow.parquet.read_table(out / "meta/episodes/chunk-000/file-000.parquet").to_pylist()
     assert info["total_episodes"] == len(episodes) == 2
     assert info["total_frames"] == sum(episode["length"] for episode in episodes)
     assert all(episode["tasks"] == ["placing"] for episode in episodes)
+    lengths = [episode["length"] for episode in episodes]
+    spans = [(episode["dataset_from_index"], episode["dataset_to_index"]) for episode in episodes]
+    assert spans == [(0, lengths[0]), (lengths[0], sum(lengths))]
+    tasks = pyarrow.parquet.read_table(out / "meta/tasks.parquet")
+    assert tasks.to_pylist() == [{"task_index": 0, "__index_level_0__": "placing"}]
+    # What makes the text the index of the table that pandas reads.
+    assert json.loads(tasks.schema.metadata[b"pandas"])["index_columns"] == ["__index_level_0__"]
 
     with AnyReader([run / "run"]) as reader:
         chosen = [connection for connection in reader.connections if connection.topic in ("/pick_place", "/heightmap")]
@@ -61,7 +71,23 @@ def test_an_exported_run_is_what_the_bag_says(start, run: pathlib.Path, tmp_path
     proposals = [message for topic, message in messages if topic == "/pick_place"]
     heightmaps = {(m.header.stamp.sec, m.header.stamp.nanosec): m for topic, m in messages if topic == "/heightmap"}
 
-    path = info["data_path"].format(episode_chunk=0, episode_index=0)
+    places = [(episode["data/chunk_index"], episode["data/file_index"]) for episode in episodes]
+    path, second = (info["data_path"].format(chunk_index=chunk, file_index=file) for chunk, file in places)
+    # The columns are those of the features that LeRobot's loader (datasets) would write itself, or it would not see pictures.
+    schema = pyarrow.parquet.read_schema(out / path)
+    arrow = {
+        "image": pa.struct([("bytes", pa.binary()), ("path", pa.string())]),
+        "float32": pa.float32(),
+        "int64": pa.int64(),
+        "bool": pa.bool_(),
+    }
+    for name, feature in info["features"].items():
+        expected = arrow[feature["dtype"]]
+        expected = expected if feature["shape"] in ([1], [320, 160, 3]) else pa.list_(expected)
+        assert schema.field(name) == pa.field(name, expected), name
+    declared = json.loads(schema.metadata[b"huggingface"])["info"]["features"]
+    assert set(declared) == set(info["features"])
+    assert declared["observation.images.workspace"] == {"_type": "Image"}
     table = pyarrow.parquet.read_table(out / path).to_pylist()
     assert set(table[0]) == set(info["features"])
     assert 6 <= len(table) == episodes[0]["length"]
@@ -82,9 +108,33 @@ def test_an_exported_run_is_what_the_bag_says(start, run: pathlib.Path, tmp_path
         assert step.with_name(step.name + "_observation.png").read_bytes() == picture
         heights = np.load(step.with_name(step.name + "_height_m.npy"))
         assert np.array_equal(heights.ravel(), seen.height_m)
-    stats = json.loads((out / "meta/episodes_stats.jsonl").read_text().splitlines()[0])["stats"]
-    assert np.allclose(stats["action"]["mean"], np.mean([row["action"] for row in table], axis=0))
+    rows = table + pyarrow.parquet.read_table(out / second).to_pylist()
+    assert [row["index"] for row in rows] == list(range(sum(lengths)))
+    stats = json.loads((out / "meta/stats.json").read_text())
     assert set(stats) == set(info["features"])
+    actions = np.array([row["action"] for row in rows])
+    for name, of in (("min", np.min), ("max", np.max), ("mean", np.mean), ("std", np.std)):
+        assert np.allclose(stats["action"][name], of(actions, axis=0), atol=1e-5), name
+    assert stats["action"]["count"] == [len(rows)]
+    assert np.shape(stats["observation.images.workspace"]["mean"]) == (3, 1, 1)
+
+
+def test_the_bag_of_a_run_shows_its_last_heightmap_steps_and_rewards(start, run: pathlib.Path) -> None:
+    info = start("sctn", "bag", "info", run / "run")
+    assert info.wait(60.0) == 0, info.log()
+    lines = info.output().splitlines()
+    (steps,) = [line for line in lines if line.startswith("steps: ")]
+    assert "placed" in steps
+    assert "reward: 1.000, complete" in lines
+    (decisions,) = [line for line in lines if line.startswith("operator: ")]
+    assert "9 advance" in decisions
+    with AnyReader([run / "run"]) as reader:
+        chosen = [connection for connection in reader.connections if connection.topic in ("/reward", "/heightmap")]
+        stamps: dict[str, int] = {}
+        for connection, _, raw in reader.messages(chosen):
+            stamp = reader.deserialize(raw, connection.msgtype).header.stamp
+            stamps[connection.topic] = stamp.sec * 10**9 + stamp.nanosec
+    assert stamps["/heightmap"] >= stamps["/reward"], "what the last step has made of the workspace is seen"
 
 
 def test_two_readers_of_others_read_every_message_of_a_recorded_run(run: pathlib.Path) -> None:
@@ -99,17 +149,6 @@ def test_two_readers_of_others_read_every_message_of_a_recorded_run(run: pathlib
     for ours, theirs in zip(sorted(by_mcap, key=key), sorted(by_rosbags, key=key), strict=True):
         assert ours[:3] == theirs[:3]
         assert same(ours[3], theirs[3]), ours[0]
-
-
-def same(ours: object, theirs: object) -> bool:
-    """Whether a message decoded by mcap-ros2-support says what the same message does by rosbags."""
-    if fields := getattr(ours, "__slots__", None):
-        return all(same(getattr(ours, name), getattr(theirs, name)) for name in fields if not name.startswith("_"))
-    if isinstance(ours, (list, tuple)):
-        return len(ours) == len(theirs) and all(map(same, ours, theirs))
-    if isinstance(ours, (bytes, bytearray, memoryview)):
-        return bytes(ours) == bytes(theirs)
-    return ours == theirs
 
 
 def test_the_page_of_the_sample_bag_reads_it() -> None:

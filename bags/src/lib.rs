@@ -8,6 +8,7 @@ mod demonstration;
 mod error;
 mod info;
 mod metadata;
+mod packing;
 mod qos;
 mod reader;
 mod run;

@@ -1,12 +1,15 @@
 //! Reading bags.
 
 use crate::metadata::{Metadata, MetadataFile};
+use crate::packing::{Packing, Unpacked, unpack};
 use crate::qos::{self, Profile};
 use crate::scan::{self, Event, MAX_RECORD_BYTES, Records, Scan};
 use crate::sqlite::{Rows, Selection, SqliteFile};
 use crate::{BagError, Qos};
 use mcap::records::op;
-use mcap::sans_io::indexed_reader::{IndexedReadEvent, IndexedReader, IndexedReaderOptions};
+use mcap::sans_io::indexed_reader::{
+    IndexedReadEvent, IndexedReader, IndexedReaderOptions, ReadOrder,
+};
 use mcap::sans_io::linear_reader::LinearReaderOptions;
 use mcap::sans_io::summary_reader::{SummaryReadEvent, SummaryReader, SummaryReaderOptions};
 use msgs::{Interface, from_cdr};
@@ -17,7 +20,6 @@ use std::io::{BufReader, Read, Seek, SeekFrom};
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::Duration;
-use tempfile::NamedTempFile;
 
 /// A topic of a bag.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -102,13 +104,6 @@ enum BagFile {
     Sqlite(SqliteFile),
 }
 
-/// How the data of each message is compressed, beside what the storage does.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-enum Packing {
-    None,
-    Zstd,
-}
-
 /// A bag. Holds the indices only; messages come one at a time.
 pub struct BagReader {
     path: PathBuf,
@@ -117,7 +112,7 @@ pub struct BagReader {
     topics: Vec<Topic>,
     notes: BTreeMap<String, String>,
     /// Files that were compressed as a whole, uncompressed.
-    _unpacked: Vec<NamedTempFile>,
+    _unpacked: Vec<Unpacked>,
 }
 
 impl BagReader {
@@ -127,7 +122,7 @@ impl BagReader {
             let listing = read_metadata(path)?;
             (listing.paths, listing.notes, listing.packing)
         } else {
-            (vec![path.to_owned()], BTreeMap::new(), Packing::None)
+            (vec![path.to_owned()], BTreeMap::new(), Packing::Undeclared)
         };
         let mut unpacked = Vec::new();
         let mut files = Vec::new();
@@ -206,9 +201,35 @@ impl BagReader {
                 topics: topics.iter().map(|&topic| topic.to_owned()).collect(),
                 from_ns: nanoseconds(from),
                 until_ns: nanoseconds(until),
+                newest_first: false,
             },
             current: None,
         }
+    }
+
+    /// The last message of a topic before a time, if there is one. Where there is an index, reads only the chunk that holds it.
+    pub fn last_before(&self, topic: &str, time: Duration) -> Result<Option<RawMessage>, BagError> {
+        let order = Order::Time {
+            topics: vec![topic.to_owned()],
+            from_ns: 0,
+            until_ns: u64::try_from(time.as_nanos()).unwrap_or(u64::MAX),
+            newest_first: true,
+        };
+        for file in self.files.iter().rev() {
+            let mut source = Source::open(file, &order)?;
+            let newest_first = matches!(source, Source::Indexed { .. });
+            let mut last = None;
+            while let Some(message) = source.next(&order)? {
+                last = Some(message);
+                if newest_first {
+                    break;
+                }
+            }
+            if let Some(message) = last {
+                return message.unpacked(self.packing).map(Some);
+            }
+        }
+        Ok(None)
     }
 }
 
@@ -229,20 +250,17 @@ pub struct FileSummary<'a> {
 
 impl BagFile {
     /// Opens a file by its ending; one compressed as a whole is uncompressed first.
-    fn open(path: PathBuf, unpacked: &mut Vec<NamedTempFile>) -> Result<Self, BagError> {
-        let extension = |path: &Path| path.extension().map(OsStr::to_owned);
-        let (actual, inner) = if extension(&path).as_deref() == Some(OsStr::new("zstd")) {
-            let file = unpack(&path)?;
-            let actual = file.path().to_owned();
-            unpacked.push(file);
-            (actual, path.with_extension(""))
-        } else {
-            (path.clone(), path)
-        };
-        if extension(&inner).as_deref() == Some(OsStr::new("db3")) {
-            return Ok(Self::Sqlite(SqliteFile::open(actual)?));
+    fn open(path: PathBuf, unpacked: &mut Vec<Unpacked>) -> Result<Self, BagError> {
+        let file = unpack(&path)?;
+        if let Some(reason) = file.cut {
+            return Err(BagError::Damaged { path, reason });
         }
-        open_mcap(actual).map(Self::Mcap)
+        let path = file.path.clone();
+        unpacked.push(file);
+        if path.extension() == Some(OsStr::new("db3")) {
+            return Ok(Self::Sqlite(SqliteFile::open(path)?));
+        }
+        open_mcap(path).map(Self::Mcap)
     }
 
     fn topics(&self) -> Box<dyn Iterator<Item = &Arc<Topic>> + '_> {
@@ -277,15 +295,6 @@ impl BagFile {
             },
         }
     }
-}
-
-/// A file that rosbag2 compressed as a whole, into a temporary one.
-fn unpack(path: &Path) -> Result<NamedTempFile, BagError> {
-    let io = |error| BagError::io(path, error);
-    let mut out = NamedTempFile::new().map_err(io)?;
-    let file = File::open(path).map_err(io)?;
-    zstd::stream::copy_decode(file, &mut out).map_err(io)?;
-    Ok(out)
 }
 
 /// What `metadata.yaml` says that a reader needs.
@@ -332,21 +341,21 @@ fn read_metadata(folder: &Path) -> Result<Listing, BagError> {
         )));
     }
     let format = information.compression_format.as_str();
-    let packing = match information.compression_mode.to_lowercase().as_str() {
-        "" | "none" | "storage" => Packing::None,
+    match information.compression_mode.to_lowercase().as_str() {
+        "" | "none" | "storage" => {}
         "file" | "message" if format != "zstd" => {
             return Err(not_a_bag(format!(
                 "its compression format is {format:?}, expected \"zstd\""
             )));
         }
-        "file" => Packing::None,
-        "message" => Packing::Zstd,
+        "file" | "message" => {}
         other => {
             return Err(not_a_bag(format!(
                 "its compression mode is {other:?}, expected none, file, message or storage"
             )));
         }
-    };
+    }
+    let packing = Packing::declared(Some(&information));
     let names = information.relative_file_paths.iter();
     let paths = names.map(|name| match Path::new(name).file_name() {
         // Only names within the folder: the file is not ours to trust.
@@ -536,6 +545,8 @@ enum Order {
         topics: Vec<String>,
         from_ns: u64,
         until_ns: u64,
+        /// Where the file's index allows it.
+        newest_first: bool,
     },
 }
 
@@ -547,6 +558,7 @@ impl Order {
                 topics,
                 from_ns,
                 until_ns,
+                ..
             } => {
                 (topics.is_empty() || topics.iter().any(|name| name == topic))
                     && (*from_ns..*until_ns).contains(&time_ns)
@@ -596,7 +608,7 @@ impl Iterator for Messages<'_> {
             let source = self.current.as_mut()?;
             match source.next(&self.order) {
                 Ok(Some(message)) => {
-                    let message = self.packing.open(message);
+                    let message = message.unpacked(self.packing);
                     return Some(message.map_err(|error| self.end(error)));
                 }
                 Ok(None) => self.current = None,
@@ -614,20 +626,15 @@ impl Messages<'_> {
     }
 }
 
-impl Packing {
-    fn open(self, message: RawMessage) -> Result<RawMessage, BagError> {
-        if self == Self::None {
-            return Ok(message);
-        }
-        let mut data = Vec::new();
-        let read = zstd::stream::read::Decoder::new(message.data.as_slice())
-            .and_then(|decoder| decoder.take(MAX_RECORD_BYTES).read_to_end(&mut data));
-        match read {
-            Ok(_) => Ok(RawMessage { data, ..message }),
-            Err(error) => Err(BagError::Packed {
-                topic: message.topic.name.clone(),
-                time: message.log_time,
-                reason: error.to_string(),
+impl RawMessage {
+    fn unpacked(self, packing: Packing) -> Result<Self, BagError> {
+        match packing.open(&self.topic.message_encoding, &self.data) {
+            Ok(None) => Ok(self),
+            Ok(Some(data)) => Ok(Self { data, ..self }),
+            Err(reason) => Err(BagError::Packed {
+                topic: self.topic.name.clone(),
+                time: self.log_time,
+                reason,
             }),
         }
     }
@@ -645,6 +652,7 @@ impl<'a> Source<'a> {
                         topics,
                         from_ns,
                         until_ns,
+                        ..
                     } => Selection::Time {
                         topics: bag_file.ids(topics),
                         from_ns: ns(*from_ns),
@@ -669,8 +677,21 @@ impl<'a> Source<'a> {
                 topics,
                 from_ns,
                 until_ns,
+                newest_first,
             } if indexed => {
+                // The library takes no known topic for every topic.
+                let known =
+                    |name: &String| bag_file.topics.values().any(|topic| topic.name == *name);
+                let until_ns = match topics.is_empty() || topics.iter().any(known) {
+                    true => until_ns,
+                    false => from_ns,
+                };
                 let mut options = IndexedReaderOptions::new()
+                    .with_order(if *newest_first {
+                        ReadOrder::ReverseLogTime
+                    } else {
+                        ReadOrder::LogTime
+                    })
                     .starting_at(*from_ns)
                     .ending_before(*until_ns)
                     .with_record_length_limit(MAX_RECORD_BYTES as usize);

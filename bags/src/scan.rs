@@ -105,11 +105,6 @@ impl Scan {
         })
     }
 
-    /// Bytes of the file.
-    pub fn size(&self) -> u64 {
-        self.size
-    }
-
     /// Where the next event begins.
     pub fn position(&self) -> u64 {
         self.position

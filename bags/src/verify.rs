@@ -1,11 +1,12 @@
 //! Is a bag whole? And what can be saved of one that is not.
 
 use crate::metadata::Metadata;
+use crate::packing::{Packing, Unpacked, inner_name, unpack};
 use crate::reader::{parse_metadata, read_summary};
 use crate::scan::{self, Damage, Event, Records, Scan};
 use crate::sqlite::{Rows, Selection, SqliteFile};
 use crate::writer::{NOTES_RECORD, Stamps};
-use crate::{BagError, BagReader, BagWriter, Topic, TopicHandle, WriteOptions};
+use crate::{BagError, BagWriter, Topic, TopicHandle, WriteOptions};
 use mcap::records::op;
 use serde::Serialize;
 use std::collections::BTreeMap;
@@ -161,23 +162,31 @@ fn find(path: &Path, findings: &mut Findings) -> Result<Found, BagError> {
     let mut paths = Vec::new();
     for entry in std::fs::read_dir(path).map_err(io)? {
         let path = entry.map_err(io)?.path();
-        if path
-            .extension()
-            .is_some_and(|extension| extension == "mcap" || extension == "db3")
-        {
+        let inner = inner_name(&path);
+        let extension = inner.as_ref().unwrap_or(&path).extension();
+        if extension.is_some_and(|extension| extension == "mcap" || extension == "db3") {
             paths.push(path);
         }
     }
+    // Its recorder stopped between compressing a file and removing it.
+    let both = paths.clone();
+    let listed = |path: &Path| {
+        let files = metadata.iter().flat_map(|found| &found.relative_file_paths);
+        let mut names = files.map(|name| Path::new(name).file_name());
+        names.any(|name| name == path.file_name())
+    };
+    paths.retain(|path| match inner_name(path) {
+        Some(inner) => !both.contains(&inner) || listed(path),
+        None => !both.iter().any(|other| {
+            listed(other) && !listed(path) && inner_name(other).as_ref() == Some(path)
+        }),
+    });
     // NAME_2 before NAME_10.
     paths.sort_by_key(|path| (path.as_os_str().len(), path.clone()));
     for listed in metadata.iter().flat_map(|found| &found.relative_file_paths) {
         let name = Path::new(listed).file_name();
         if !paths.iter().any(|path| path.file_name() == name) {
-            let reason = if listed.ends_with(".zstd") {
-                format!("{listed} is compressed as a whole: uncompress it with zstd -d first")
-            } else {
-                format!("{listed} is listed and not there")
-            };
+            let reason = format!("{listed} is listed and not there");
             findings.add("metadata.yaml", None, reason);
         }
     }
@@ -195,6 +204,16 @@ fn name_of(path: &Path) -> String {
         .unwrap_or_default()
         .to_string_lossy()
         .into_owned()
+}
+
+/// A file of a bag to be looked through, uncompressed if it was compressed as a whole; where that ends early is told.
+fn open(path: &Path, findings: &mut Findings) -> Result<Unpacked, BagError> {
+    let unpacked = unpack(path)?;
+    if let Some(reason) = &unpacked.cut {
+        let reason = format!("cannot be uncompressed to its end: {reason}");
+        findings.add(&name_of(path), None, reason);
+    }
+    Ok(unpacked)
 }
 
 fn is_sqlite(path: &Path) -> bool {
@@ -261,6 +280,19 @@ impl Channels {
         Ok(())
     }
 
+    /// Takes note of a message of one of them.
+    fn message(
+        &self,
+        header: &mcap::records::MessageHeader,
+        data: &[u8],
+        topics: &mut Topics,
+    ) -> Result<(), String> {
+        let id = header.channel_id;
+        let topic = self.channels.get(&id);
+        let topic = topic.ok_or_else(|| format!("a message of the unknown channel {id}"))?;
+        topics.message(topic, header.sequence, header.log_time, data)
+    }
+
     fn of_summary(summary: &mcap::Summary) -> Self {
         let schemas = summary.schemas.iter();
         let channels = summary.channels.iter();
@@ -280,14 +312,19 @@ impl Channels {
 pub fn verify(path: &Path) -> Result<Verification, BagError> {
     let mut findings = Findings::default();
     let found = find(path, &mut findings)?;
-    let mut topics = Topics::default();
+    let mut topics = Topics::of(Packing::declared(found.metadata.as_ref()));
     let mut files = Vec::new();
     for path in &found.paths {
-        let file = if is_sqlite(path) {
-            verify_sqlite(path, &mut findings, &mut topics)?
+        let unpacked = open(path, &mut findings)?;
+        let name = name_of(path);
+        let mut file = if is_sqlite(&unpacked.path) {
+            verify_sqlite(&unpacked.path, name, &mut findings, &mut topics)?
         } else {
-            verify_mcap(path, &mut findings, &mut topics)?
+            verify_mcap(&unpacked.path, name, &mut findings, &mut topics)?
         };
+        file.bytes = std::fs::metadata(path)
+            .map_err(|error| BagError::io(path, error))?
+            .len();
         files.push(file);
     }
     if let Some(metadata) = &found.metadata {
@@ -297,7 +334,7 @@ pub fn verify(path: &Path) -> Result<Verification, BagError> {
         path: path.to_owned(),
         whole: findings.count == 0,
         files,
-        topics: topics.0.into_iter().map(Progress::finish).collect(),
+        topics: topics.by_name.into_iter().map(Progress::finish).collect(),
         findings,
     })
 }
@@ -318,14 +355,16 @@ fn compare_metadata(
     differ("in all", metadata.message_count, total);
     for topic in &metadata.topics_with_message_count {
         let name = &topic.topic_metadata.name;
-        let found = topics.0.get(name).map_or(0, |topic| topic.messages);
+        let found = topics.by_name.get(name).map_or(0, |topic| topic.messages);
         differ(&format!("on {name}"), topic.message_count, found);
     }
 }
 
-/// Topics by name while messages pass.
-#[derive(Default)]
-struct Topics(BTreeMap<String, Progress>);
+/// Topics while messages pass.
+struct Topics {
+    packing: Packing,
+    by_name: BTreeMap<String, Progress>,
+}
 
 #[derive(Default)]
 struct Progress {
@@ -337,10 +376,24 @@ struct Progress {
 }
 
 impl Topics {
-    fn message(&mut self, topic: &Topic, sequence: u32, log_time: u64) {
-        let progress = match self.0.get_mut(&topic.name) {
+    fn of(packing: Packing) -> Self {
+        Self {
+            packing,
+            by_name: BTreeMap::new(),
+        }
+    }
+
+    /// Takes note of a message; an error if it was compressed by itself and is damaged.
+    fn message(
+        &mut self,
+        topic: &Topic,
+        sequence: u32,
+        log_time: u64,
+        data: &[u8],
+    ) -> Result<(), String> {
+        let progress = match self.by_name.get_mut(&topic.name) {
             Some(progress) => progress,
-            None => self.0.entry(topic.name.clone()).or_default(),
+            None => self.by_name.entry(topic.name.clone()).or_default(),
         };
         progress.type_name.clone_from(&topic.type_name);
         progress.messages += 1;
@@ -354,6 +407,11 @@ impl Topics {
             }
         }
         progress.last = Some((sequence, log_time));
+        let opened = self.packing.open(&topic.message_encoding, data);
+        opened.map(drop).map_err(|reason| {
+            let name = &topic.name;
+            format!("a message on {name} that cannot be uncompressed: {reason}")
+        })
     }
 }
 
@@ -372,14 +430,11 @@ impl Progress {
 
 fn verify_sqlite(
     path: &Path,
+    name: String,
     findings: &mut Findings,
     topics: &mut Topics,
 ) -> Result<VerifiedFile, BagError> {
-    let name = name_of(path);
     let mut verified = VerifiedFile {
-        bytes: std::fs::metadata(path)
-            .map_err(|error| BagError::io(path, error))?
-            .len(),
         name: name.clone(),
         ..VerifiedFile::default()
     };
@@ -391,7 +446,10 @@ fn verify_sqlite(
         let mut rows = Rows::new(Selection::File);
         while let Some(message) = rows.next(&file)? {
             verified.messages += 1;
-            topics.message(&message.topic, 0, message.time.as_nanos() as u64);
+            let time = message.time.as_nanos() as u64;
+            if let Err(reason) = topics.message(&message.topic, 0, time, &message.data) {
+                findings.add(&name, None, reason);
+            }
         }
         Ok(())
     };
@@ -437,11 +495,11 @@ impl Tally {
 
 fn verify_mcap(
     path: &Path,
+    name: String,
     findings: &mut Findings,
     topics: &mut Topics,
 ) -> Result<VerifiedFile, BagError> {
     let io = |error| BagError::io(path, error);
-    let name = name_of(path);
     let summary = read_summary(path);
     let hints = summary.as_ref().map_or_else(|_| Vec::new(), chunk_offsets);
     if let Err(error) = &summary {
@@ -452,7 +510,6 @@ fn verify_mcap(
     let mut scan = Scan::new(File::open(path).map_err(io)?, hints).map_err(io)?;
     let mut verified = VerifiedFile {
         name: name.clone(),
-        bytes: scan.size(),
         ..VerifiedFile::default()
     };
     let mut channels = Channels::default();
@@ -490,13 +547,12 @@ fn verify_mcap(
                         }
                         continue;
                     }
-                    if let Some((header, _)) = scan::message(body) {
+                    if let Some((header, data)) = scan::message(body) {
                         let index = tally.last_chunk.entry(header.channel_id).or_default();
                         index.push((header.log_time, within));
                         tally.message(&header);
-                        match channels.channels.get(&header.channel_id) {
-                            Some(topic) => topics.message(topic, header.sequence, header.log_time),
-                            None => findings.add(&name, Some(offset), unknown_channel(&header)),
+                        if let Err(reason) = channels.message(&header, data, topics) {
+                            findings.add(&name, Some(offset), reason);
                         }
                         verified.messages += 1;
                     }
@@ -513,11 +569,10 @@ fn verify_mcap(
                     }
                 }
                 op::MESSAGE => {
-                    if let Some((header, _)) = scan::message(body) {
+                    if let Some((header, data)) = scan::message(body) {
                         tally.message(&header);
-                        match channels.channels.get(&header.channel_id) {
-                            Some(topic) => topics.message(topic, header.sequence, header.log_time),
-                            None => findings.add(&name, Some(offset), unknown_channel(&header)),
+                        if let Err(reason) = channels.message(&header, data, topics) {
+                            findings.add(&name, Some(offset), reason);
                         }
                         verified.messages += 1;
                     }
@@ -590,10 +645,6 @@ fn verify_mcap(
         compare_summary(&name, summary, &tally, findings);
     }
     Ok(verified)
-}
-
-fn unknown_channel(header: &mcap::records::MessageHeader) -> String {
-    format!("a message of the unknown channel {}", header.channel_id)
 }
 
 fn compare_summary(name: &str, summary: &mcap::Summary, tally: &Tally, findings: &mut Findings) {
@@ -696,6 +747,7 @@ pub fn recover(
     BagWriter::discard_partial(copy)?;
     let mut copied = Copied {
         bag: BagWriter::create(copy, options)?,
+        packing: Packing::declared(found.metadata.as_ref()),
         topics: BTreeMap::new(),
         counts: BTreeMap::new(),
         chunks: 0,
@@ -705,10 +757,12 @@ pub fn recover(
         copied.bag.note(&key, value);
     }
     for path in &found.paths {
-        if is_sqlite(path) {
-            copied.sqlite(path, &mut lost)?;
+        let unpacked = open(path, &mut lost)?;
+        let name = name_of(path);
+        if is_sqlite(&unpacked.path) {
+            copied.sqlite(&unpacked.path, name, &mut lost)?;
         } else {
-            copied.mcap(path, &mut lost)?;
+            copied.mcap(&unpacked.path, name, &mut lost)?;
         }
     }
     let messages = copied.bag.message_count();
@@ -726,13 +780,26 @@ pub fn recover(
 /// A copy that is being made.
 struct Copied {
     bag: BagWriter,
+    packing: Packing,
     topics: BTreeMap<String, TopicHandle>,
     counts: BTreeMap<String, u64>,
     chunks: u64,
 }
 
 impl Copied {
-    fn write(&mut self, topic: &Topic, stamps: Stamps, data: &[u8]) -> Result<(), BagError> {
+    /// Also topics without messages; two of one name and different types come to light with their messages.
+    fn announce(&mut self, topic: &Topic) {
+        if let Ok(handle) = self.bag.add_topic_of(topic) {
+            self.topics.insert(topic.name.clone(), handle);
+            self.counts.entry(topic.name.clone()).or_default();
+        }
+    }
+
+    /// Writes a message as it was before rosbag2 compressed it; `false`: that cannot be undone.
+    fn write(&mut self, topic: &Topic, stamps: Stamps, data: &[u8]) -> Result<bool, BagError> {
+        let Ok(data) = self.packing.open_cow(&topic.message_encoding, data) else {
+            return Ok(false);
+        };
         let handle = match self.topics.get(&topic.name) {
             Some(handle) => *handle,
             None => {
@@ -742,55 +809,54 @@ impl Copied {
                 handle
             }
         };
-        self.bag.write_stamped(handle, stamps, data)?;
+        self.bag.write_stamped(handle, stamps, &data)?;
         if let Some(count) = self.counts.get_mut(&topic.name) {
             *count += 1;
         }
-        Ok(())
+        Ok(true)
     }
 
-    fn sqlite(&mut self, path: &Path, lost: &mut Findings) -> Result<(), BagError> {
-        let reader = match BagReader::open(path) {
-            Ok(reader) => reader,
-            Err(error @ (BagError::Damaged { .. } | BagError::NotABag { .. })) => {
-                lost.add(&name_of(path), None, error.to_string());
-                return Ok(());
+    fn sqlite(&mut self, path: &Path, name: String, lost: &mut Findings) -> Result<(), BagError> {
+        let mut read = || -> Result<(), BagError> {
+            let file = SqliteFile::open(path.to_owned())?;
+            for topic in file.topics.values() {
+                self.announce(topic);
             }
-            Err(error) => return Err(error),
-        };
-        for message in reader.messages() {
-            match message {
-                Ok(message) => {
-                    let stamps = Stamps {
-                        sequence: message.sequence,
-                        log_time: message.log_time,
-                        publish_time: message.publish_time,
-                    };
-                    self.write(&message.topic, stamps, &message.data)?;
+            let mut rows = Rows::new(Selection::File);
+            while let Some(message) = rows.next(&file)? {
+                let stamps = Stamps {
+                    sequence: 0,
+                    log_time: message.time,
+                    publish_time: message.time,
+                };
+                if !self.write(&message.topic, stamps, &message.data)? {
+                    lost.add(&name, None, packed(&message.topic));
                 }
-                Err(error) => lost.add(&name_of(path), None, error.to_string()),
             }
+            Ok(())
+        };
+        match read() {
+            Err(error @ (BagError::Damaged { .. } | BagError::NotABag { .. })) => {
+                lost.add(&name, None, error.to_string());
+                Ok(())
+            }
+            other => other,
         }
-        Ok(())
     }
 
-    fn mcap(&mut self, path: &Path, lost: &mut Findings) -> Result<(), BagError> {
+    fn mcap(&mut self, path: &Path, name: String, lost: &mut Findings) -> Result<(), BagError> {
         let io = |error| BagError::io(path, error);
-        let name = name_of(path);
         let summary = read_summary(path).ok();
         let hints = summary.as_ref().map_or_else(Vec::new, chunk_offsets);
         let mut channels = summary.as_ref().map(Channels::of_summary);
         let channels = channels.get_or_insert_default();
         for topic in channels.channels.values() {
-            // Also those without messages; two of one name and different types come to light with their messages.
-            if let Ok(handle) = self.bag.add_topic_of(topic) {
-                self.topics.insert(topic.name.clone(), handle);
-                self.counts.entry(topic.name.clone()).or_default();
-            }
+            self.announce(topic);
         }
         let mut scan = Scan::new(File::open(path).map_err(io)?, hints).map_err(io)?;
         let mut orphans: BTreeMap<u16, u64> = BTreeMap::new();
         let mut ended = false;
+        let mut packed_wrong: BTreeMap<String, u64> = BTreeMap::new();
         let mut message = |copied: &mut Self, channels: &Channels, body: &[u8]| {
             let Some((header, data)) = scan::message(body) else {
                 return Ok(());
@@ -804,7 +870,10 @@ impl Copied {
                 log_time: Duration::from_nanos(header.log_time),
                 publish_time: Duration::from_nanos(header.publish_time),
             };
-            copied.write(topic, stamps, data)
+            if !copied.write(topic, stamps, data)? {
+                *packed_wrong.entry(packed(topic)).or_default() += 1;
+            }
+            Ok::<_, BagError>(())
         };
         while let Some(event) = scan.next().map_err(io)? {
             match event {
@@ -847,10 +916,18 @@ impl Copied {
             let reason = "its data has no end: its writer stopped half-way, or it was cut";
             lost.add(&name, None, reason.into());
         }
+        for (reason, count) in packed_wrong {
+            lost.add(&name, None, format!("{count} times {reason}"));
+        }
         for (channel, count) in orphans {
             let reason = format!("{count} messages of the unknown channel {channel}");
             lost.add(&name, None, reason);
         }
         Ok(())
     }
+}
+
+fn packed(topic: &Topic) -> String {
+    let name = &topic.name;
+    format!("a message on {name} that cannot be uncompressed")
 }

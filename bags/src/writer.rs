@@ -31,6 +31,8 @@ impl Default for Compression {
 
 /// Target size of a chunk before compression: what a reader must hold in memory.
 const CHUNK_BYTES: u64 = 4 << 20;
+/// Smaller ones, where files are to be small, would be all overhead.
+const MIN_CHUNK_BYTES: u64 = 1 << 16;
 /// Name of the metadata records that keep the notes of a bag that has no `metadata.yaml` yet.
 pub(crate) const NOTES_RECORD: &str = "sctn notes";
 
@@ -43,6 +45,14 @@ pub struct WriteOptions {
     pub split_bytes: Option<u64>,
     /// A new file begins when the present one spans this much log time.
     pub split_duration: Option<Duration>,
+}
+
+impl WriteOptions {
+    /// A file is looked at once a chunk.
+    fn chunk_bytes(self) -> u64 {
+        let limit = self.split_bytes.unwrap_or(CHUNK_BYTES);
+        limit.clamp(MIN_CHUNK_BYTES, CHUNK_BYTES)
+    }
 }
 
 impl From<Compression> for WriteOptions {
@@ -142,7 +152,7 @@ impl BagWriter {
         })?;
         Ok(Self {
             folder: folder.to_owned(),
-            open: OpenFile::create(&partial, format!("{name}_0.mcap"), options.compression)?,
+            open: OpenFile::create(&partial, format!("{name}_0.mcap"), options)?,
             name: name.to_owned(),
             partial,
             options,
@@ -313,7 +323,7 @@ impl BagWriter {
         }
         match self.options.split_bytes {
             // Looked up once a chunk.
-            Some(limit) if open.unmeasured >= CHUNK_BYTES.min(limit) => {
+            Some(limit) if open.unmeasured >= self.options.chunk_bytes() => {
                 open.unmeasured = 0;
                 Ok(open.bytes()? >= limit)
             }
@@ -324,7 +334,7 @@ impl BagWriter {
     /// Completes the present file and begins the next one.
     pub fn split(&mut self) -> Result<(), BagError> {
         let name = format!("{}_{}.mcap", self.name, self.complete.len() + 1);
-        let mut next = OpenFile::create(&self.partial, name, self.options.compression)?;
+        let mut next = OpenFile::create(&self.partial, name, self.options)?;
         for topic in &mut self.topics {
             next.add(topic)?;
         }
@@ -480,12 +490,12 @@ impl BagWriter {
 }
 
 impl OpenFile {
-    fn create(folder: &Path, name: String, compression: Compression) -> Result<Self, BagError> {
+    fn create(folder: &Path, name: String, options: WriteOptions) -> Result<Self, BagError> {
         let path = folder.join(&name);
         let io = |source| BagError::io(&path, source);
         let file = File::create_new(&path).map_err(io)?;
         let clone = file.try_clone().map_err(io)?;
-        let (compression, level) = match compression {
+        let (compression, level) = match options.compression {
             Compression::None => (None, 0),
             Compression::Zstd(level) => (Some(mcap::Compression::Zstd), level),
         };
@@ -496,7 +506,7 @@ impl OpenFile {
             .compression_level(level)
             // Threads of its own would cost more than they win on chunks of this size.
             .compression_threads(0)
-            .chunk_size(Some(CHUNK_BYTES))
+            .chunk_size(Some(options.chunk_bytes()))
             .create(BufWriter::new(clone))
             .map_err(|error| BagError::mcap(&path, error))?;
         Ok(Self {

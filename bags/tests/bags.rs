@@ -122,6 +122,16 @@ fn a_topic_and_a_span_of_time_are_found_without_the_rest() {
     assert_eq!(found(&["/chatter"]), (2345..2355).collect::<Vec<_>>());
     assert_eq!(found(&["/clock"]), [2350]);
     assert_eq!(found(&[]).len(), 11);
+    assert_eq!(found(&["/other"]).len(), 0);
+    let last = |topic: &str, milliseconds: u64| {
+        let message = reader.last_before(topic, Duration::from_millis(milliseconds));
+        message.unwrap().map(|message| message.log_time.as_millis())
+    };
+    assert_eq!(last("/clock", 2355), Some(2350));
+    assert_eq!(last("/clock", 2350), Some(2340));
+    assert_eq!(last("/chatter", 1_000_000), Some(4999));
+    assert_eq!(last("/chatter", 0), None);
+    assert_eq!(last("/other", 2355), None);
 }
 
 #[test]
@@ -161,14 +171,126 @@ fn bags_of_another_program_are_read() {
             .map(|message| message.unwrap().log_time.subsec_nanos())
             .collect();
         assert_eq!(times, [2, 3], "{name}");
+        let last = reader.last_before("/chatter", until).unwrap().unwrap();
+        assert_eq!(last.data, messages[3].data, "{name}");
         let folder = TempDir::new().unwrap();
         let copy = folder.path().join("copy");
-        if name != "rosbags_sqlite_file" && name != "rosbags_sqlite_message" {
-            assert!(bags::verify(&bag).unwrap().whole, "{name}");
-            let recovery = bags::recover(&bag, &copy, Compression::None).unwrap();
-            assert_eq!((recovery.messages, recovery.complete), (6, true));
-        }
+        // Whatever was compressed, how, and by whom: the copy holds the messages as they were before.
+        let verification = bags::verify(&bag).unwrap();
+        assert!(verification.whole, "{name}: {:?}", verification.findings);
+        let recovery = bags::recover(&bag, &copy, Compression::None).unwrap();
+        assert_eq!((recovery.messages, recovery.complete), (6, true), "{name}");
+        let data = |messages: &[RawMessage]| -> Vec<Vec<u8>> {
+            messages
+                .iter()
+                .map(|message| message.data.clone())
+                .collect()
+        };
+        let copied = BagReader::open(&copy).unwrap();
+        let copied: Vec<RawMessage> = copied.messages().map(Result::unwrap).collect();
+        assert_eq!(data(&copied), data(&messages), "{name}");
     }
+}
+
+/// A file as rosbag2 compresses it: one frame of zstd.
+fn compress(file: &Path) {
+    let packed = zstd::encode_all(std::fs::File::open(file).unwrap(), 3).unwrap();
+    let mut name = file.as_os_str().to_owned();
+    name.push(".zstd");
+    std::fs::write(name, packed).unwrap();
+}
+
+#[test]
+fn a_file_compressed_as_a_whole_is_verified_and_saved_up_to_its_damage() {
+    let (folder, bag) = folder();
+    write(&bag, 20_000, Compression::None);
+    let plain = file(&bag);
+    compress(&plain);
+    let packed = bag.join("run_0.mcap.zstd");
+    // Its recorder was killed before it removed the file itself: the messages count once.
+    let metadata = std::fs::read_to_string(bag.join("metadata.yaml")).unwrap();
+    assert!(bags::verify(&bag).unwrap().whole);
+    std::fs::remove_file(&plain).unwrap();
+    std::fs::write(
+        bag.join("metadata.yaml"),
+        metadata
+            .replace("run_0.mcap", "run_0.mcap.zstd")
+            .replace("compression_format: ''", "compression_format: zstd")
+            .replace("compression_mode: ''", "compression_mode: FILE"),
+    )
+    .unwrap();
+    let verification = bags::verify(&bag).unwrap();
+    assert!(verification.whole, "{:?}", verification.findings);
+    assert_eq!(verification.files[0].name, "run_0.mcap.zstd");
+    assert_eq!(BagReader::open(&bag).unwrap().messages().count(), 22_000);
+
+    let mut bytes = std::fs::read(&packed).unwrap();
+    bytes.truncate(bytes.len() / 2);
+    std::fs::write(&packed, &bytes).unwrap();
+    let verification = bags::verify(&bag).unwrap();
+    assert!(!verification.whole);
+    let first = &verification.findings.first[0];
+    assert_eq!(first.file, "run_0.mcap.zstd");
+    assert!(
+        first.reason.starts_with("cannot be uncompressed"),
+        "{first:?}"
+    );
+    let error = BagReader::open(&bag).err().unwrap();
+    assert!(matches!(error, BagError::Damaged { .. }), "{error}");
+    // Also without the metadata, as its recorder leaves it when it is killed.
+    std::fs::remove_file(bag.join("metadata.yaml")).unwrap();
+    let copy = folder.path().join("copy");
+    let recovery = bags::recover(&bag, &copy, Compression::None).unwrap();
+    assert!(!recovery.complete);
+    assert!(
+        (1_000..22_000).contains(&recovery.messages),
+        "{}",
+        recovery.messages
+    );
+    let reader = BagReader::open(&copy).unwrap();
+    let texts = reader.messages().map(Result::unwrap);
+    let texts = texts.filter(|message| message.topic.name == "/chatter");
+    for (index, message) in texts.enumerate() {
+        let said: std_msgs::String = message.decode().unwrap();
+        assert_eq!(said.data, index.to_string());
+    }
+}
+
+#[test]
+fn a_damaged_message_among_compressed_ones_is_told_and_left_out() {
+    let (folder, bag) = folder();
+    let mut writer = BagWriter::create(&bag, Compression::None).unwrap();
+    let topic = writer
+        .add::<std_msgs::String>("/chatter", Qos::RELIABLE)
+        .unwrap();
+    for index in 0..10u64 {
+        let cdr = msgs::to_cdr(&text(format!("{index}"))).unwrap();
+        let mut packed = zstd::encode_all(cdr.as_slice(), 3).unwrap();
+        if index == 4 {
+            packed.truncate(packed.len() - 3);
+        }
+        let time = Duration::from_millis(index);
+        writer.write_cdr(topic, time, time, &packed).unwrap();
+    }
+    writer.finish().unwrap();
+    // Nobody says that they are compressed: what they begin with does.
+    let verification = bags::verify(&bag).unwrap();
+    assert_eq!(verification.findings.count, 1);
+    let reason = &verification.findings.first[0].reason;
+    assert!(
+        reason.contains("/chatter that cannot be uncompressed"),
+        "{reason}"
+    );
+    let copy = folder.path().join("copy");
+    let recovery = bags::recover(&bag, &copy, Compression::None).unwrap();
+    assert_eq!((recovery.messages, recovery.complete), (9, false));
+    let reader = BagReader::open(&copy).unwrap();
+    let said = reader.messages().map(|message| {
+        let said: std_msgs::String = message.unwrap().decode().unwrap();
+        said.data
+    });
+    let said: Vec<String> = said.collect();
+    assert_eq!(said, ["0", "1", "2", "3", "5", "6", "7", "8", "9"]);
 }
 
 #[test]

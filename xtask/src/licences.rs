@@ -5,7 +5,7 @@ use anyhow::{Context as _, Result, bail};
 use serde::Deserialize;
 
 /// SPDX names of the licences that we accept.
-const PERMISSIVE: [&str; 13] = [
+const PERMISSIVE: [&str; 14] = [
     "0BSD",
     "Apache-2.0",
     "BSD-2-Clause",
@@ -15,6 +15,7 @@ const PERMISSIVE: [&str; 13] = [
     "ISC",
     "MIT",
     "MIT-0",
+    "NCSA",
     "Unicode-3.0",
     "Unicode-DFS-2016",
     "Unlicense",

@@ -39,6 +39,7 @@ pub async fn configure(node: Node, parameters: GctnPolicyParameters) -> anyhow::
     let path = parameters.checkpoint()?.to_owned();
     let outputs = Outputs {
         node: node.clone(),
+        said: None,
         proposals: node.publisher("pick_place", Qos::Latched)?,
         markers: node.publisher("pick_place/markers", Qos::Latched)?,
         scores: node.publisher("pick_place/scores", Qos::Latched)?,
@@ -100,7 +101,12 @@ impl Active for PolicyNode {
                     proposer.confirmed(&confirmation);
                     None
                 }
-                result = results.recv() => proposer.result(&result),
+                result = results.recv() => {
+                    if proposer.is_overlooked(&result) {
+                        self.outputs.say_again();
+                    }
+                    proposer.result(&result)
+                }
                 answer = answers.recv() => {
                     let answer = answer.context("the network's thread has ended")?;
                     let decision = answer.decision.as_ref().map_err(Clone::clone);
@@ -163,13 +169,23 @@ fn start_network(
 
 struct Outputs {
     node: Node,
+    /// The last proposal.
+    said: Option<PickPlace>,
     proposals: Publisher<PickPlace>,
     markers: Publisher<MarkerArray>,
     scores: Publisher<Image>,
 }
 
 impl Outputs {
-    fn publish(&self, proposal: Result<PickPlace, String>, answer: &Answer) {
+    /// The same proposal once more; who knows it notices nothing.
+    fn say_again(&self) {
+        if let Some(proposal) = &self.said {
+            info!("proposal {} still stands", proposal.id);
+            self.proposals.publish(proposal.clone());
+        }
+    }
+
+    fn publish(&mut self, proposal: Result<PickPlace, String>, answer: &Answer) {
         let took_s = ("network_s", format!("{:.3}", answer.took.as_secs_f64()));
         let reason = match (proposal, &answer.decision) {
             (Ok(proposal), Ok(decision)) => {
@@ -178,6 +194,7 @@ impl Outputs {
                     "proposal {} for step {}, attempt {}",
                     proposal.id, proposal.step, proposal.attempt
                 );
+                self.said = Some(proposal.clone());
                 self.proposals.publish(proposal);
                 info!("{message}");
                 self.node

@@ -78,6 +78,8 @@ pub struct Proposer {
     newest: Option<Observation>,
     rejected: Vec<Isometry2<f64>>,
     progress: Progress,
+    /// The operator has rejected somebody else's proposal for this goal.
+    rejected_another: bool,
     /// The network works on an answer that nobody needs any more.
     outdated: bool,
 }
@@ -91,6 +93,7 @@ impl Proposer {
             newest: None,
             rejected: Vec::new(),
             progress: Progress::Waiting,
+            rejected_another: false,
             outdated: false,
         }
     }
@@ -147,8 +150,9 @@ impl Proposer {
                 && before.stamp == wanted.stamp
                 && before.message.attempt < wanted.message.attempt;
             match (&self.progress, same_step) {
+                // Somebody else's proposal may have been rejected: that says nothing about this pick.
                 (Progress::Proposed(_, _, pick) | Progress::Approved(_, _, pick), _)
-                    if rejected =>
+                    if rejected && !self.rejected_another =>
                 {
                     self.rejected.push(*pick);
                 }
@@ -159,6 +163,7 @@ impl Proposer {
                 self.newest = None;
             }
         }
+        self.rejected_another = false;
         self.outdated |= matches!(self.progress, Progress::Deciding(_));
         self.goal = Some(wanted);
         self.progress = Progress::Waiting;
@@ -167,6 +172,11 @@ impl Proposer {
 
     /// The operator has spoken: an approved proposal stands while the arm moves.
     pub fn confirmed(&mut self, confirmation: &StepConfirmation) {
+        if let Progress::Proposed(_, id, _) = &self.progress
+            && confirmation.decision == StepConfirmation::REJECT
+        {
+            self.rejected_another = *id != confirmation.proposal_id;
+        }
         let approves = confirmation.decision == StepConfirmation::APPROVE;
         if let Progress::Proposed(observation, id, pick) = &self.progress
             && approves
@@ -174,6 +184,13 @@ impl Proposer {
         {
             self.progress = Progress::Approved(observation.clone(), *id, *pick);
         }
+    }
+
+    /// Whether the proposal should be said again: the operator has decided on another one, which the executor refused, and
+    /// may see that one in its place.
+    pub fn is_overlooked(&self, result: &StepResult) -> bool {
+        matches!(&self.progress, Progress::Proposed(_, id, _) if *id != result.proposal_id)
+            && result.outcome == StepResult::REFUSED
     }
 
     /// The executor has reported: after a motion nothing more is proposed for this goal, after a refusal
@@ -493,6 +510,25 @@ mod tests {
         proposer.decided(Ok(&decision(0.7)));
         let job = proposer.wanted(goal(2, 0, 5)).unwrap().unwrap();
         assert!(job.exclude.is_empty());
+    }
+
+    #[test]
+    fn somebody_elses_proposal_hides_ours_only_until_the_operators_word_on_it_is_refused() {
+        let (mut proposer, proposal) = proposed();
+        let theirs = proposal.id ^ 1;
+        proposer.confirmed(&confirmation(StepConfirmation::APPROVE, theirs));
+        assert!(proposer.is_overlooked(&result(theirs, StepResult::REFUSED)));
+        assert_eq!(proposer.result(&result(theirs, StepResult::REFUSED)), None);
+        assert!(!proposer.is_overlooked(&result(proposal.id, StepResult::REFUSED)));
+        assert!(!proposer.is_overlooked(&result(theirs, StepResult::PLACED)));
+        // Its rejection says nothing about our pick.
+        proposer.confirmed(&confirmation(StepConfirmation::REJECT, theirs));
+        let job = proposer.wanted(goal(1, 1, 0)).unwrap().unwrap();
+        assert!(job.exclude.is_empty());
+        proposer.decided(Ok(&decision(0.6)));
+        proposer.confirmed(&confirmation(StepConfirmation::REJECT, 1));
+        proposer.wanted(goal(2, 0, 7)).unwrap();
+        assert!(!proposer.is_overlooked(&result(theirs, StepResult::REFUSED)));
     }
 
     #[test]

@@ -120,7 +120,9 @@ pub struct Oracle {
     stamp: Time,
     stopped: bool,
     current: Option<Current>,
-    /// Proposals of earlier goals, and superseded ones of this.
+    /// Earlier proposals for the present goal. The executor may have found that what came after them is no proposal.
+    superseded: BTreeSet<u64>,
+    /// Proposals of earlier goals and for other ones.
     seen: BTreeSet<u64>,
     decider: Decider,
 }
@@ -195,6 +197,7 @@ impl Oracle {
             stamp: Time::default(),
             stopped: false,
             current: None,
+            superseded: BTreeSet::new(),
             seen: BTreeSet::new(),
             decider,
         }
@@ -238,14 +241,17 @@ impl Oracle {
             return;
         }
         let moved = self.current.is_some_and(|current| current.moved.is_some());
-        if moved || self.seen.contains(&proposal.id) {
+        let known = self.seen.contains(&proposal.id) || self.superseded.contains(&proposal.id);
+        if moved || known {
             return;
         }
         match &self.current {
             Some(current) if current.id == proposal.id => {}
             other => {
-                if let Some(superseded) = *other {
-                    self.remember(superseded.id);
+                if let Some(superseded) = *other
+                    && self.superseded.len() < MAX_SEEN
+                {
+                    self.superseded.insert(superseded.id);
                 }
                 self.current = Some(Current {
                     id: proposal.id,
@@ -281,6 +287,18 @@ impl Oracle {
         // The proposal itself may have been published before this node was discovered: the executor
         // has seen it, and it is not one of an earlier goal.
         if self.current.is_none() && !self.seen.contains(&id) {
+            self.current = Some(Current {
+                id,
+                moved: None,
+                waiting: None,
+            });
+        }
+        // What came after it was no proposal to the executor, which knows more of them.
+        if self.superseded.contains(&id)
+            && self
+                .current
+                .is_some_and(|current| current.id != id && current.moved.is_none())
+        {
             self.current = Some(Current {
                 id,
                 moved: None,
@@ -379,6 +397,9 @@ impl Oracle {
     fn latch(&mut self, index: usize, attempt: u32, stamp: Time) -> Change {
         if let Some(current) = self.current.take() {
             self.remember(current.id);
+        }
+        for id in std::mem::take(&mut self.superseded) {
+            self.remember(id);
         }
         self.index = index;
         self.attempt = attempt;
@@ -578,10 +599,6 @@ mod tests {
         let mut oracle = oracle(2);
         oracle.proposed(&proposal(7, 1, 0));
         oracle.proposed(&proposal(8, 1, 0));
-        assert_eq!(
-            oracle.result(&result(7, StepResult::PLACED, 5)),
-            Change::None
-        );
         assert!(matches!(
             oracle.confirmed(&says(StepConfirmation::ADVANCE, 7)),
             Err(Refusal::Stale { id: 7, .. })
@@ -591,6 +608,27 @@ mod tests {
             .confirmed(&says(StepConfirmation::ADVANCE, 8))
             .unwrap();
         assert_eq!(goal(change), (2, 0, 6, false));
+    }
+
+    #[test]
+    fn what_the_executor_carried_out_counts_whatever_was_proposed_since() {
+        let mut oracle = oracle(2);
+        oracle.proposed(&proposal(7, 1, 0));
+        // Readable, of this step, and nothing that the executor would do.
+        oracle.proposed(&proposal(8, 1, 0));
+        oracle.result(&result(7, StepResult::PLACED, 5));
+        assert!(
+            oracle
+                .confirmed(&says(StepConfirmation::ADVANCE, 8))
+                .is_err()
+        );
+        let change = oracle
+            .confirmed(&says(StepConfirmation::ADVANCE, 7))
+            .unwrap();
+        assert_eq!(goal(change), (2, 0, 5, false));
+        // Said again, it is a proposal of an earlier goal.
+        oracle.result(&result(7, StepResult::PLACED, 5));
+        assert_eq!(oracle.progress(), (2, 2, 0));
     }
 
     #[test]

@@ -22,7 +22,8 @@ use std::time::Duration;
 /// Arguments of `sctn bench`.
 #[derive(Args)]
 pub struct Bench {
-    /// Only benchmarks whose name contains this; those of problems are called demonstration_PROBLEM
+    /// Only benchmarks whose name contains this; those of problems are called demonstration_PROBLEM. `idle`: what the graph
+    /// costs while it waits for an operator
     name: Option<String>,
     /// Demonstrations of each problem
     #[arg(long, default_value_t = 10)]
@@ -150,6 +151,9 @@ struct Report {
 
 impl Bench {
     pub fn run(self, root: &Root) -> Result<()> {
+        if self.name.as_deref() == Some("idle") {
+            return crate::idle::run(self.json);
+        }
         let wanted = |name: &str| self.name.as_ref().is_none_or(|part| name.contains(part));
         let chosen: Vec<_> = WORKLOADS.iter().filter(|w| wanted(w.name)).collect();
         let problems = root.join("config/problems");

@@ -9,6 +9,7 @@ mod evaluate;
 mod gallery;
 mod goals;
 mod health;
+mod idle;
 mod latency;
 mod launch;
 mod picture;

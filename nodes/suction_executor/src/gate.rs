@@ -16,6 +16,8 @@ use crate::status::DriverStatus;
 const HEIGHTMAPS: usize = 64;
 /// Proposals whose fate is remembered.
 const PROPOSALS: usize = 1024;
+/// Messages that are no proposal, of which it is remembered why.
+const INVALID: usize = 64;
 
 /// What a proposal must keep to.
 #[derive(Clone, Debug, PartialEq)]
@@ -150,6 +152,8 @@ pub struct Gate {
     newest: Option<Newest>,
     /// Oldest first; the last is the newest proposal's.
     fates: VecDeque<(u64, Fate)>,
+    /// What came as a proposal and is none, and why. Kept apart: no number of them takes anything from a proposal.
+    invalid: VecDeque<(u64, String)>,
     moving: Option<u64>,
     /// The arm is on its way home at an operator's call.
     homing: bool,
@@ -166,6 +170,7 @@ impl Gate {
             present: None,
             newest: None,
             fates: VecDeque::new(),
+            invalid: VecDeque::new(),
             moving: None,
             homing: false,
             moved_until: None,
@@ -218,7 +223,8 @@ impl Gate {
         }
     }
 
-    /// Takes a proposal, or what is wrong with the message of that id; it supersedes the one before.
+    /// Takes a proposal, or what is wrong with the message of that id. A valid one supersedes the one before; what is no
+    /// proposal supersedes nothing, so that nobody's garbage takes away what the operator was offered.
     pub fn propose(&mut self, id: u64, proposal: Result<Proposal, String>) -> Proposed {
         if self.fate(id).is_some() {
             if let Some(newest) = &mut self.newest
@@ -232,26 +238,47 @@ impl Gate {
             }
             return Proposed::Repeated;
         }
+        if self.why_invalid(id).is_some() {
+            return Proposed::Repeated;
+        }
+        let checked = proposal.and_then(|proposal| {
+            self.rules.check(&proposal)?;
+            Ok(proposal)
+        });
+        if let Err(reason) = checked {
+            if self.invalid.len() == INVALID {
+                self.invalid.pop_front();
+            }
+            self.invalid.push_back((id, reason.clone()));
+            return Proposed::Invalid(reason);
+        }
         self.set_fate_of_open(Fate::Superseded);
         if self.fates.len() == PROPOSALS {
             self.fates.pop_front();
         }
         self.fates.push_back((id, Fate::Open));
-        let checked = proposal.and_then(|proposal| {
-            self.rules.check(&proposal)?;
-            Ok(proposal)
-        });
-        let proposed = match &checked {
-            Ok(_) => Proposed::Open,
-            Err(reason) => Proposed::Invalid(reason.clone()),
-        };
         self.newest = Some(Newest {
             id,
             checked,
             own: None,
         });
         self.find_own();
-        proposed
+        Proposed::Open
+    }
+
+    fn why_invalid(&self, id: u64) -> Option<&str> {
+        let mut known = self.invalid.iter().rev();
+        known
+            .find(|(known, _)| *known == id)
+            .map(|(_, reason)| reason.as_str())
+    }
+
+    /// What to say of an id that has no fate.
+    fn unknown(&self, id: u64) -> Verdict {
+        match self.why_invalid(id) {
+            Some(reason) => Verdict::refuse(reason),
+            None => Verdict::Wait(format!("proposal {id} is unknown")),
+        }
     }
 
     /// Takes a confirmation at a monotonic time. `plan` says why the motion cannot be planned from
@@ -307,7 +334,7 @@ impl Gate {
         plan: impl FnOnce(&DriverStatus, &Proposal) -> Result<(), String>,
     ) -> Verdict {
         match self.fate(id) {
-            None => return Verdict::Wait(format!("proposal {id} is unknown")),
+            None => return self.unknown(id),
             Some(Fate::Open) => {}
             Some(fate) => return Verdict::refuse(fate.reason(id)),
         }
@@ -356,7 +383,7 @@ impl Gate {
 
     fn reject(&mut self, id: u64) -> Verdict {
         match self.fate(id) {
-            None => Verdict::Wait(format!("proposal {id} is unknown")),
+            None => self.unknown(id),
             Some(Fate::Open) => {
                 self.set_fate(id, Fate::Rejected);
                 Verdict::Answer(Answer::Rejected, "rejected by the operator".into())
@@ -710,9 +737,9 @@ mod tests {
                 assert!(error.contains(which) && error.contains(expected), "{error}");
                 let verdict = approve(&mut gate, 8);
                 assert_refused(&gate, verdict, &["8", which, expected]);
-                // It has superseded the one before all the same.
+                // It has taken nothing from the one before.
                 let verdict = approve(&mut gate, 7);
-                assert_refused(&gate, verdict, &["7", "superseded"]);
+                assert_eq!(verdict, Verdict::Move(Box::new(proposal(7))));
             }
         }
         let mut gate = gate();
@@ -729,6 +756,19 @@ mod tests {
         assert_eq!(gate.propose(8, broken()), Proposed::Repeated);
         let verdict = approve(&mut gate, 8);
         assert_refused(&gate, verdict, &["x is not finite"]);
+    }
+
+    #[test]
+    fn no_number_of_messages_that_are_no_proposals_takes_away_the_one_that_is() {
+        let mut gate = gate();
+        for id in 100..5000 {
+            let mut garbage = proposal(id);
+            garbage.action.pick.translation.x = 7.0;
+            invalid(&mut gate, garbage);
+        }
+        let verdict = decide(&mut gate, 4999, Decision::Reject);
+        assert_refused(&gate, verdict, &["4999", "outside the workspace"]);
+        assert!(matches!(approve(&mut gate, 7), Verdict::Move(_)));
     }
 
     #[test]

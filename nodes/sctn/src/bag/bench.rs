@@ -41,6 +41,9 @@ pub struct Bench {
     /// Seconds that three cameras are recorded; 0: not at all
     #[arg(long, default_value_t = 60)]
     seconds: u64,
+    /// Gigabytes of a bag that is listed and played from the middle; 0: none
+    #[arg(long, value_name = "GB", default_value_t = 0)]
+    large: u64,
     /// Print a JSON object last
     #[arg(long)]
     json: bool,
@@ -73,6 +76,9 @@ impl Bench {
         }
         let mut report = json!({"writer": writer});
         let mut complete = true;
+        if self.large > 0 {
+            report["large"] = large(folder.path(), &data, self.large)?;
+        }
         if self.seconds > 0 {
             let recording = record(folder.path(), self.seconds)?;
             complete = recording["lost"] == 0;
@@ -84,6 +90,15 @@ impl Bench {
                 recording["mb_s"].as_f64().unwrap_or(0.0),
                 recording["peak_mb"].as_f64().unwrap_or(0.0)
             );
+            if let Some(dropped) = recording["socket_drops"]
+                .as_u64()
+                .filter(|count| *count > 0)
+            {
+                println!(
+                    "  {dropped} datagrams found a full socket buffer meanwhile: the images are best effort, and the recorder did not get \
+                     the processor in time; net.core.rmem_max allows a larger buffer"
+                );
+            }
             println!(
                 "that bag, {:.1} GB: listed in {:.3} s; the first message from the middle after {:.3} s; this process has had \
                  at most {:.0} MB",
@@ -241,6 +256,82 @@ fn peak_mb(process: &str) -> Option<f64> {
     Some(kilobytes * 1024.0 / 1e6)
 }
 
+/// Runs `sctn bag`; how long it took, and the most memory that it has had.
+fn measured(arguments: &[&str], out: &Path) -> Result<(f64, f64)> {
+    let started = Instant::now();
+    let mut child = start(arguments, out)?;
+    let id = child.0.id().to_string();
+    let mut peak = 0.0f64;
+    let status = loop {
+        if let Some(status) = child.0.try_wait()? {
+            break status;
+        }
+        peak = peak.max(peak_mb(&id).unwrap_or(0.0));
+        std::thread::sleep(Duration::from_millis(2));
+    };
+    if !status.success() {
+        bail!("sctn bag {}: {status}", arguments.join(" "));
+    }
+    Ok((started.elapsed().as_secs_f64(), peak))
+}
+
+/// Lists a large bag, and plays two seconds from its middle.
+fn large(folder: &Path, data: &[u8], gigabytes: u64) -> Result<Value> {
+    let (path, out) = (folder.join("large"), folder.join("large.out"));
+    let mut bag = BagWriter::create(&path, Compression::None)?;
+    let topic = bag.add::<Image>("/image", Qos::RELIABLE)?;
+    let count = gigabytes * 1000;
+    // Messages that a player takes: they begin as CDR does.
+    let mut message = vec![0; MESSAGE_BYTES];
+    for (index, noise) in (0..count).zip(data.chunks_exact(MESSAGE_BYTES).cycle()) {
+        message.copy_from_slice(noise);
+        message[..4].copy_from_slice(&[0, 1, 0, 0]);
+        let time = Duration::from_millis(10 * index);
+        bag.write_cdr(topic, time, time, &message)?;
+    }
+    bag.finish()?;
+    let name = path.display().to_string();
+    let (info_s, info_mb) = measured(&["info", &name], &out)?;
+    let start = (count / 200).to_string();
+    let (play_s, play_mb) = measured(
+        &[
+            "play",
+            &name,
+            "--start",
+            &start,
+            "--duration",
+            "2",
+            "--json",
+        ],
+        &out,
+    )?;
+    let played = last_json(&out)?["messages"].as_u64().context("messages")?;
+    std::fs::remove_dir_all(&path)?;
+    println!(
+        "a bag of {gigabytes} GB: listed in {info_s:.2} s with at most {info_mb:.0} MB of memory; two seconds played from the \
+         middle, {played} messages in {play_s:.1} s with at most {play_mb:.0} MB"
+    );
+    Ok(json!({
+        "gb": gigabytes,
+        "info_s": info_s,
+        "info_peak_mb": info_mb,
+        "play_s": play_s,
+        "play_messages": played,
+        "play_peak_mb": play_mb,
+    }))
+}
+
+/// Datagrams for which this machine's kernel found no room in a socket's buffer.
+fn socket_drops() -> Option<u64> {
+    let text = std::fs::read_to_string("/proc/net/snmp").ok()?;
+    let mut lines = text.lines().filter_map(|line| line.strip_prefix("Udp: "));
+    let (names, values) = lines.next().zip(lines.next())?;
+    let column = names
+        .split_whitespace()
+        .position(|name| name == "RcvbufErrors")?;
+    values.split_whitespace().nth(column)?.parse().ok()
+}
+
 fn record(folder: &Path, seconds: u64) -> Result<Value> {
     let path = folder.join("recording");
     let (out, cameras_out) = (folder.join("record.out"), folder.join("cameras.out"));
@@ -255,6 +346,7 @@ fn record(folder: &Path, seconds: u64) -> Result<Value> {
         &bag,
         "--json",
     ];
+    let dropped_before = socket_drops();
     let mut recorder = start(&arguments, &out)?;
     let seconds_text = seconds.to_string();
     let mut cameras = start(&["bench", "--publish", &seconds_text], &cameras_out)?;
@@ -278,6 +370,9 @@ fn record(folder: &Path, seconds: u64) -> Result<Value> {
         peak = peak.max(peak_mb(&recorder.0.id().to_string()).unwrap_or(0.0));
         std::thread::sleep(Duration::from_millis(20));
     }
+    let dropped = socket_drops()
+        .zip(dropped_before)
+        .map(|(after, before)| after - before);
     let recorded = last_json(&out)?;
     let sent = last_json(&cameras_out)?["sent"].as_u64().context("sent")?;
     let messages = recorded["messages"].as_u64().context("messages")?;
@@ -299,6 +394,7 @@ fn record(folder: &Path, seconds: u64) -> Result<Value> {
         "sent": sent,
         "messages": messages,
         "lost": sent.saturating_sub(messages),
+        "socket_drops": dropped,
         "mb_s": bytes / 1e6 / (last - first).as_secs_f64(),
         "peak_mb": peak,
         "gb": bytes / 1e9,

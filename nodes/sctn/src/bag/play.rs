@@ -437,16 +437,11 @@ fn latched_before(
 ) -> Result<()> {
     let latched = chosen.iter().filter(|topic| offered(topic).transient_local);
     for topic in latched {
-        let mut last = None;
-        for message in bag.messages_between(&[&topic.name], Duration::ZERO, begin) {
-            let message = message?;
-            if topic.type_name == TFMessage::TYPE_NAME {
-                stage.publish(message);
-            } else {
-                last = Some(message);
+        if topic.type_name == TFMessage::TYPE_NAME {
+            for message in bag.messages_between(&[&topic.name], Duration::ZERO, begin) {
+                stage.publish(message?);
             }
-        }
-        if let Some(message) = last {
+        } else if let Some(message) = bag.last_before(&topic.name, begin)? {
             stage.publish(message);
         }
     }

@@ -1,10 +1,14 @@
 //! Records topics of any type as a bag: `sctn bag record` and `sctn launch --record`.
+//!
+//! What a run decides, does and earns (confirmations, results, rewards) is handed to the system as soon as it arrives,
+//! with all that came before it, and is never left out for want of room in the queue. A step result that is safe in this way
+//! is said once more on its topic's [`KEPT`]: who hears it there finds it in the bag, whatever becomes of the recorder.
 
 use anyhow::{Context as _, Result, anyhow};
 use bags::{BagError, BagWriter, Qos, Stamps, TopicHandle, WriteOptions};
 use msgs::Interface;
 use msgs::sctn_msgs::{Reward, StepConfirmation, StepResult};
-use node_kit::{Node, Offer, RawQos};
+use node_kit::{Node, Offer, RawPublisher, RawQos};
 use regex::RegexSet;
 use serde::Serialize;
 use std::collections::{BTreeMap, BTreeSet};
@@ -25,6 +29,8 @@ const FLUSHED_AT_ONCE: [&str; 3] = [
     StepResult::TYPE_NAME,
     Reward::TYPE_NAME,
 ];
+/// Under the topic of step results: those that survive the end of the recorder. Hidden from other recorders.
+pub const KEPT: &str = "_recorded";
 /// Messages of these types are large: RustDDS keeps as many as the depth says, also those that were taken.
 const LARGE: [&str; 3] = [
     "sensor_msgs/msg/Image",
@@ -154,6 +160,8 @@ enum Entry {
         name: String,
         type_name: String,
         offered: Vec<Qos>,
+        /// Where to say which messages are safe.
+        kept: Option<RawPublisher>,
     },
     Note(&'static str, String),
     Message {
@@ -169,13 +177,24 @@ enum Entry {
 struct Shared {
     queued_bytes: AtomicUsize,
     received_bytes: AtomicU64,
-    counts: Mutex<Vec<(String, TopicCount)>>,
+    heard: Mutex<Vec<Heard>>,
     ended: AtomicBool,
 }
 
+/// What has come on a topic.
+struct Heard {
+    topic: String,
+    count: TopicCount,
+    /// The first fields of the last message.
+    head: [u8; STAMP_END],
+}
+
+/// Where the stamp ends in a message that begins with one: after the CDR header, seconds and nanoseconds.
+const STAMP_END: usize = 4 + 4 + 4;
+
 impl Shared {
-    fn counts(&self) -> MutexGuard<'_, Vec<(String, TopicCount)>> {
-        self.counts.lock().unwrap_or_else(PoisonError::into_inner)
+    fn heard(&self) -> MutexGuard<'_, Vec<Heard>> {
+        self.heard.lock().unwrap_or_else(PoisonError::into_inner)
     }
 }
 
@@ -214,7 +233,7 @@ impl Recorder {
         let writing = Writing {
             disk: put_on_disk(&bag)?,
             bag,
-            handles: Vec::new(),
+            topics: Vec::new(),
             shared: Arc::clone(&shared),
             min_free_bytes: options.min_free_bytes,
         };
@@ -257,6 +276,21 @@ impl Recorder {
             tokio::time::sleep(LOOK_EVERY).await;
         }
         Ok(())
+    }
+
+    /// Waits until the writing has ended by itself; [`Self::finish`] says why.
+    pub async fn ended(&self) {
+        while !self.shared.ended.load(Relaxed) {
+            tokio::time::sleep(LOOK_EVERY).await;
+        }
+    }
+
+    /// Stamp of the last message on a topic whose type begins with a stamp or a header, if one has come [ns].
+    pub fn last_stamp_ns(&self, topic: &str) -> Option<i64> {
+        let name = self.node.resolve(topic);
+        let heard = self.shared.heard();
+        let heard = heard.iter().find(|heard| heard.topic == name)?;
+        (heard.count.messages > 0).then(|| stamp_ns(&heard.head))
     }
 
     fn look(&mut self, selection: &Selection) -> Result<()> {
@@ -316,17 +350,33 @@ impl Recorder {
                 followed.index
             }
             None => {
-                let mut counts = self.shared.counts();
-                counts.push((topic.to_owned(), TopicCount::default()));
+                let kept = if type_name == StepResult::TYPE_NAME && !topic.ends_with(KEPT) {
+                    let qos = RawQos {
+                        reliable: true,
+                        transient_local: false,
+                        depth: 64,
+                    };
+                    let name = format!("{topic}/{KEPT}");
+                    Some(self.node.raw_publisher(&name, type_name, qos)?)
+                } else {
+                    None
+                };
+                let mut heard = self.shared.heard();
+                heard.push(Heard {
+                    topic: topic.to_owned(),
+                    count: TopicCount::default(),
+                    head: [0; STAMP_END],
+                });
                 let entry = Entry::Topic {
-                    index: counts.len() - 1,
+                    index: heard.len() - 1,
                     name: topic.to_owned(),
                     type_name: type_name.to_owned(),
                     offered: offered.to_vec(),
+                    kept,
                 };
                 // The writing has ended: its reason comes out at the end.
                 let _ = self.queue.send(entry);
-                counts.len() - 1
+                heard.len() - 1
             }
         };
         let mut subscription = self.node.raw_subscription(topic, type_name, asked)?;
@@ -336,7 +386,7 @@ impl Recorder {
         let flush = FLUSHED_AT_ONCE.contains(&type_name);
         let clock = self.options.use_sim_time.then(|| self.node.clock().clone());
         let task = self.node.spawn(async move {
-            let mut sequence = shared.counts()[index].1.sequence();
+            let mut sequence = shared.heard()[index].count.sequence();
             loop {
                 let message = subscription.recv().await;
                 let now = match &clock {
@@ -346,14 +396,18 @@ impl Recorder {
                         .unwrap_or_default(),
                 };
                 let length = message.data.len();
-                let full = shared.queued_bytes.load(Relaxed) + length > limit;
+                // Small, rare, and what the rest is worth nothing without.
+                let full = !flush && shared.queued_bytes.load(Relaxed) + length > limit;
                 {
-                    let count = &mut shared.counts()[index].1;
-                    count.lost_in_transport += message.lost_before;
+                    let heard = &mut shared.heard()[index];
+                    heard.count.lost_in_transport += message.lost_before;
                     if full {
-                        count.lost_in_queue += 1;
+                        heard.count.lost_in_queue += 1;
                     } else {
-                        count.messages += 1;
+                        heard.count.messages += 1;
+                        let head = message.data.len().min(STAMP_END);
+                        heard.head = [0; STAMP_END];
+                        heard.head[..head].copy_from_slice(&message.data[..head]);
                     }
                 }
                 sequence += message.lost_before + 1;
@@ -395,7 +449,7 @@ impl Recorder {
             bytes: self.shared.received_bytes.load(Relaxed),
             ..Progress::default()
         };
-        for (_, count) in self.shared.counts().iter() {
+        for Heard { count, .. } in self.shared.heard().iter() {
             progress.messages += count.messages;
             progress.lost_in_transport += count.lost_in_transport;
             progress.lost_in_queue += count.lost_in_queue;
@@ -440,7 +494,11 @@ impl Recorder {
             messages,
             bytes,
             files,
-            topics: shared.counts().iter().cloned().collect(),
+            topics: shared
+                .heard()
+                .iter()
+                .map(|heard| (heard.topic.clone(), heard.count.clone()))
+                .collect(),
         })
     }
 }
@@ -450,6 +508,18 @@ impl TopicCount {
     fn sequence(&self) -> u64 {
         self.messages + self.lost_in_transport + self.lost_in_queue
     }
+}
+
+/// The stamp at the beginning of a message, whichever its byte order.
+fn stamp_ns(head: &[u8; STAMP_END]) -> i64 {
+    let field = |at: usize| {
+        let bytes = [head[at], head[at + 1], head[at + 2], head[at + 3]];
+        match head[1] & 1 {
+            1 => u32::from_le_bytes(bytes),
+            _ => u32::from_be_bytes(bytes),
+        }
+    };
+    i64::from(field(4) as i32) * 1_000_000_000 + i64::from(field(8))
 }
 
 fn qos(offer: RawQos) -> Qos {
@@ -481,7 +551,7 @@ fn put_on_disk(bag: &BagWriter) -> Result<mpsc::SyncSender<File>> {
 struct Writing {
     bag: BagWriter,
     disk: mpsc::SyncSender<File>,
-    handles: Vec<Option<TopicHandle>>,
+    topics: Vec<Option<(TopicHandle, Option<RawPublisher>)>>,
     shared: Arc<Shared>,
     min_free_bytes: u64,
 }
@@ -511,10 +581,12 @@ impl Writing {
                     name,
                     type_name,
                     offered,
+                    kept,
                 } => {
                     let handle = self.add(&name, &type_name, &offered)?;
-                    self.handles.resize(self.handles.len().max(index + 1), None);
-                    self.handles[index] = Some(handle);
+                    let count = self.topics.len().max(index + 1);
+                    self.topics.resize_with(count, || None);
+                    self.topics[index] = Some((handle, kept));
                 }
                 Entry::Note(key, value) => self.bag.note(key, value),
                 Entry::Message {
@@ -524,13 +596,16 @@ impl Writing {
                     flush,
                 } => {
                     self.shared.queued_bytes.fetch_sub(data.len(), Relaxed);
-                    let handle = self.handles.get(index).copied().flatten();
-                    let handle = handle.context("a message of a topic that was not announced")?;
-                    self.bag.write_stamped(handle, stamps, &data)?;
-                    unflushed = !flush;
+                    let topic = self.topics.get(index).and_then(Option::as_ref);
+                    let (handle, kept) =
+                        topic.context("a message of a topic that was not announced")?;
+                    self.bag.write_stamped(*handle, stamps, &data)?;
+                    unflushed = true;
                     if flush {
                         self.bag.flush()?;
-                        flushed = Instant::now();
+                        if let Some(kept) = kept {
+                            kept.publish(data);
+                        }
                     }
                 }
             }

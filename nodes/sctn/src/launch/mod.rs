@@ -17,7 +17,7 @@ use msgs::sctn_msgs::{Goal, PickPlace, Reward, StepConfirmation, StepResult};
 use multiravens::Environment;
 use node_kit::{Node, Qos, ns_from_stamp, wait_for_end};
 use operator::{Operator, OperatorKind, Question, automatic};
-use recording::RunRecorder;
+use recording::{LAST_HEIGHTMAP, RunRecorder};
 use serde::Serialize;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
@@ -165,8 +165,12 @@ impl Launch {
             .map(|_| RunRecorder::start(&folder.join("run"), settings, self.record_images))
             .transpose()?;
         let (context, node) = plain_node("sctn_launch", &[])?;
+        let results = match recorder {
+            Some(_) => RunRecorder::kept_results(),
+            None => "step_result".to_owned(),
+        };
         let confirms = settings.operated && settings.goal_module == ORACLE;
-        let mut desk = Desk::new(&node, confirms)?;
+        let mut desk = Desk::new(&node, &results, confirms)?;
         let mut graph = if self.processes {
             Graph::spawn(root, settings, &folder.join("logs"))?
         } else {
@@ -176,9 +180,13 @@ impl Launch {
             // Policy, executor and oracle hear the operator, and so does the recorder.
             let listeners = 3 + usize::from(recorder.is_some());
             graph.bring_up(&node, listeners).await?;
+            if let Some(recorder) = &recorder {
+                recorder.wait_for_desk().await;
+            }
             tokio::select! {
                 ended = desk.work(self.operator, max_steps) => ended,
                 error = graph.failure() => Err(error),
+                () = recording_ended(recorder.as_ref()) => Err(anyhow::anyhow!("the recording ended before the run")),
             }
         };
         let ended = tokio::select! {
@@ -186,7 +194,8 @@ impl Launch {
             result = wait_for_end() => result.and(Err(anyhow::anyhow!("stopped by a signal"))),
         };
         if let Some(recorder) = &recorder {
-            recorder.last_words().await;
+            let measured_ns = ended.is_ok().then_some(desk.measured_ns);
+            recorder.last_words(measured_ns).await;
         }
         graph.stop(&context).await;
         let bag = match recorder {
@@ -222,6 +231,14 @@ impl Launch {
     }
 }
 
+/// Waits until the recording has ended by itself; for ever without one.
+async fn recording_ended(recorder: Option<&RunRecorder>) {
+    match recorder {
+        Some(recorder) => recorder.ended().await,
+        None => std::future::pending().await,
+    }
+}
+
 /// The operator's desk: what arrives, what is decided, how far the run is.
 struct Desk {
     node: Node,
@@ -248,13 +265,14 @@ struct Desk {
 }
 
 impl Desk {
-    fn new(node: &Node, confirms: bool) -> Result<Self> {
+    /// `results`: the topic of step results, or of those that are safe.
+    fn new(node: &Node, results: &str, confirms: bool) -> Result<Self> {
         Ok(Self {
             node: node.clone(),
             confirms,
             goals_reached: false,
             proposals: node.subscription("pick_place", Qos::Latched)?,
-            results: node.subscription("step_result", Qos::Event)?,
+            results: node.subscription(results, Qos::Event)?,
             rewards: node.subscription("reward", Qos::Event)?,
             goals: node.subscription("goal", Qos::Latched)?,
             heightmaps: node.subscription("heightmap", Qos::Latched)?,
@@ -401,7 +419,7 @@ impl Desk {
                 .map(|message| ns_from_stamp(&message.header.stamp))
         };
         while seen(&self.last_heightmap) < Some(self.measured_ns) {
-            let next = tokio::time::timeout(Duration::from_secs(2), self.heightmaps.recv()).await;
+            let next = tokio::time::timeout(LAST_HEIGHTMAP, self.heightmaps.recv()).await;
             match next {
                 Ok(heightmap) => self.last_heightmap = Some(heightmap),
                 Err(_) => return tracing::warn!("no heightmap came after the last step"),

@@ -1,6 +1,6 @@
 //! What `sctn launch` records of a run.
 
-use crate::bag::recorder::{Recorder, RecorderOptions, Recording};
+use crate::bag::recorder::{KEPT, Recorder, RecorderOptions, Recording};
 use crate::launch::graph::Settings;
 use crate::plain_node::plain_node;
 use anyhow::Result;
@@ -10,13 +10,17 @@ use msgs::rosgraph_msgs::Clock;
 use msgs::sctn_msgs::{Goal, Heightmap, PickPlace, Reward, StepConfirmation, StepResult};
 use msgs::sensor_msgs::{CameraInfo, Image, JointState};
 use msgs::tf2_msgs::TFMessage;
-use node_kit::Context;
+use node_kit::{Context, Node};
 use std::path::Path;
 use std::time::Duration;
 
 const CAMERAS: [&str; 3] = ["front", "left", "right"];
 /// What was sent last may still be on its way, or have to be sent again: who sent it must live so long.
 const LAST_WORDS: Duration = Duration::from_millis(500);
+/// How long the desk may take to find the recorder.
+const DISCOVERY: Duration = Duration::from_secs(20);
+/// How long what shows the end of the run may take: images are best effort, and said again twice a second.
+pub const LAST_HEIGHTMAP: Duration = Duration::from_secs(20);
 
 const TOPICS: [(&str, &str, Qos); 9] = [
     ("heightmap", Heightmap::TYPE_NAME, Qos::LATCHED),
@@ -37,6 +41,7 @@ const TOPICS: [(&str, &str, Qos); 9] = [
 /// A run that is being recorded, by a node of its own: so it hears the operator of this command too.
 pub struct RunRecorder {
     context: Context,
+    node: Node,
     recorder: Recorder,
 }
 
@@ -60,12 +65,44 @@ impl RunRecorder {
                 recorder.expect(&format!("{camera}/{topic}"), type_name, Qos::BEST_EFFORT)?;
             }
         }
-        Ok(Self { context, recorder })
+        Ok(Self {
+            context,
+            node,
+            recorder,
+        })
     }
 
-    /// Waits for what is still on its way; to be called before the nodes end.
-    pub async fn last_words(&self) {
+    /// Topic on which a step result is said once the bag holds it: a step goes on from what cannot be lost any more.
+    pub fn kept_results() -> String {
+        format!("step_result/{KEPT}")
+    }
+
+    /// Waits until somebody listens to [`Self::kept_results`].
+    pub async fn wait_for_desk(&self) {
+        let topic = self.node.resolve(&Self::kept_results());
+        let graph = self.node.graph();
+        for topic in graph.wait_for_subscriptions(&[topic], DISCOVERY).await {
+            tracing::warn!("nobody listens to {topic}");
+        }
+    }
+
+    /// Waits for what is still on its way, and for a heightmap that is not older than `measured_ns`, if there is one to come;
+    /// to be called before the nodes end.
+    pub async fn last_words(&self, measured_ns: Option<i64>) {
+        let shown = async {
+            while self.recorder.last_stamp_ns("heightmap") < measured_ns {
+                tokio::time::sleep(Duration::from_millis(20)).await;
+            }
+        };
+        if tokio::time::timeout(LAST_HEIGHTMAP, shown).await.is_err() {
+            tracing::warn!("the bag has no heightmap of after the last step");
+        }
         tokio::time::sleep(LAST_WORDS).await;
+    }
+
+    /// Waits until the recording has ended by itself.
+    pub async fn ended(&self) {
+        self.recorder.ended().await;
     }
 
     /// Completes the bag.

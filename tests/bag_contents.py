@@ -1,0 +1,38 @@
+"""What a bag holds, by rosbags; what is published so that a recorder hears it."""
+
+from __future__ import annotations
+
+import pathlib
+
+from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rosbags.highlevel import AnyReader
+from rosbags.typesys import Stores, get_typestore
+
+from cell_operator import Operator
+
+STORE = get_typestore(Stores.ROS2_JAZZY)
+# Many messages in a short time: none may fall out of a reader's history.
+DEEP = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.VOLATILE)
+
+
+def contents(bag: pathlib.Path, *topics: str) -> list[tuple[str, object]]:
+    """Topic and deserialised message, in the order of the bag, by rosbags."""
+    with AnyReader([bag], default_typestore=STORE) as reader:
+        chosen = [connection for connection in reader.connections if not topics or connection.topic in topics]
+        return [(c.topic, reader.deserialize(raw, c.msgtype)) for c, _, raw in reader.messages(chosen)]
+
+
+def wait_for_recorder(operator: Operator, *publishers) -> None:
+    """Until each of them has a subscription."""
+    operator.until(lambda: all(p.get_subscription_count() >= 1 for p in publishers), "recorder that listens", 30.0)
+
+
+def same(ours: object, theirs: object) -> bool:
+    """Whether a message decoded by mcap-ros2-support says what the same message does by rosbags."""
+    if (fields := getattr(ours, "__slots__", None)) is not None:
+        return all(same(getattr(ours, name), getattr(theirs, name)) for name in fields if not name.startswith("_"))
+    if isinstance(ours, (list, tuple)):
+        return len(ours) == len(theirs) and all(map(same, ours, theirs))
+    if isinstance(ours, (bytes, bytearray, memoryview)):
+        return bytes(ours) == bytes(theirs)
+    return ours == theirs

@@ -378,7 +378,9 @@ impl Oracle {
                 }
                 (None, Some(_)) => Err(Refusal::Twice { id }),
             },
-            _ if self.seen.contains(&id) => Err(Refusal::Stale { id, step, attempt }),
+            _ if self.seen.contains(&id) || self.superseded.contains(&id) => {
+                Err(Refusal::Stale { id, step, attempt })
+            }
             _ => Err(Refusal::Unknown { id, step, attempt }),
         }
     }

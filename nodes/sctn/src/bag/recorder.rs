@@ -161,7 +161,7 @@ enum Entry {
         type_name: String,
         offered: Vec<Qos>,
         /// Where to say which messages are safe.
-        kept: Option<RawPublisher>,
+        kept: Option<Box<RawPublisher>>,
     },
     Note(&'static str, String),
     Message {
@@ -357,7 +357,7 @@ impl Recorder {
                         depth: 64,
                     };
                     let name = format!("{topic}/{KEPT}");
-                    Some(self.node.raw_publisher(&name, type_name, qos)?)
+                    Some(Box::new(self.node.raw_publisher(&name, type_name, qos)?))
                 } else {
                     None
                 };
@@ -551,7 +551,7 @@ fn put_on_disk(bag: &BagWriter) -> Result<mpsc::SyncSender<File>> {
 struct Writing {
     bag: BagWriter,
     disk: mpsc::SyncSender<File>,
-    topics: Vec<Option<(TopicHandle, Option<RawPublisher>)>>,
+    topics: Vec<Option<(TopicHandle, Option<Box<RawPublisher>>)>>,
     shared: Arc<Shared>,
     min_free_bytes: u64,
 }

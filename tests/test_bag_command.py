@@ -93,6 +93,9 @@ def test_what_cannot_be_done_has_its_exit_code_and_reason(start, tmp_path: pathl
     assert missing.wait(60.0) == FAILED
     assert "missing" in missing.errors()
     write_scans(tmp_path / "bag", "mcap")
+    late = start("sctn", "bag", "play", tmp_path / "bag", "--start", 1000)
+    assert late.wait(60.0) == FAILED
+    assert "--start is 1000 s, expected at most the 49.000 s" in late.errors()
     occupied = start("sctn", "bag", "recover", tmp_path / "bag", "--out", tmp_path / "bag")
     assert occupied.wait(60.0) == FAILED
     assert "exists already" in occupied.errors()

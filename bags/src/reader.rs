@@ -200,7 +200,7 @@ impl BagReader {
             order: Order::Time {
                 topics: topics.iter().map(|&topic| topic.to_owned()).collect(),
                 from_ns: nanoseconds(from),
-                until_ns: nanoseconds(until),
+                until_ns: nanoseconds(until.max(from)),
                 newest_first: false,
             },
             current: None,

@@ -210,6 +210,14 @@ impl Play {
             .span()
             .with_context(|| format!("{}: holds no message", self.bag.display()))?;
         let begin = first + seconds(self.start).context("--start")?;
+        if begin > last {
+            bail!(
+                "--start is {} s, expected at most the {:.3} s that {} lasts",
+                self.start,
+                (last - first).as_secs_f64(),
+                self.bag.display()
+            );
+        }
         let end = match self.duration {
             Some(duration) => begin + seconds(duration).context("--duration")?,
             None => last + Duration::from_nanos(1),

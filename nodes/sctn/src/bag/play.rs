@@ -1,6 +1,6 @@
 //! `sctn bag play`.
 
-use super::{DAMAGED, record::seconds};
+use super::{DAMAGED, record::seconds, recorder::LARGE};
 use crate::plain_node::plain_node;
 use anyhow::{Context as _, Result, bail};
 use bags::{BagReader, RawMessage, Topic};
@@ -469,6 +469,8 @@ fn offered(topic: &Topic) -> RawQos {
         depth: match (reliable, transient_local) {
             (_, true) if topic.type_name == TFMessage::TYPE_NAME => 64,
             (_, true) => depth.clamp(1, 64),
+            // Of images a second's worth: a gigabyte of them would be kept otherwise.
+            (true, false) if LARGE.contains(&topic.type_name.as_str()) => 32,
             (true, false) => 512,
             (false, false) => 8,
         },

@@ -32,7 +32,7 @@ const FLUSHED_AT_ONCE: [&str; 3] = [
 /// Under the topic of step results: those that survive the end of the recorder. Hidden from other recorders.
 pub const KEPT: &str = "_recorded";
 /// Messages of these types are large: RustDDS keeps as many as the depth says, also those that were taken.
-const LARGE: [&str; 3] = [
+pub const LARGE: [&str; 3] = [
     "sensor_msgs/msg/Image",
     "sensor_msgs/msg/PointCloud2",
     "sensor_msgs/msg/CompressedImage",

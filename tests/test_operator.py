@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import copy
 from typing import Any
 
 import numpy as np
 from sctn_msgs.msg import Goal, Heightmap, PickPlace, StepConfirmation, StepResult
 
-from cell_operator import Operator, nanoseconds
+from cell_operator import LATCHED, Operator, nanoseconds
 
 NODES = {"camera_fusion", "goal_oracle", "gctn_policy", "suction_executor", "sim_workcell"}
 DISKS = 9
@@ -44,6 +45,22 @@ def test_an_operator_in_python_sees_the_graph_and_places_all_nine_disks(start, o
     proposal = next_proposal(operator, goal)
     assert proposal.id != first.id
     assert (proposal.pick.x, proposal.pick.y) != (first.pick.x, first.pick.y)
+
+    # Somebody's garbage takes nothing away: its approval is refused, the policy says its own again, and that one can be approved.
+    garbage = copy.deepcopy(proposal)
+    garbage.id ^= 1
+    garbage.pick.x = 9.0
+    somebody = operator.node.create_publisher(PickPlace, "pick_place", LATCHED)
+    # Executor, oracle, launch and this test.
+    operator.until(lambda: somebody.get_subscription_count() >= 4, "readers of proposals", 30.0)
+    somebody.publish(garbage)
+    operator.next("pick_place", accept=lambda made: made.id == garbage.id)
+    said = operator.count("pick_place")
+    refusal = operator.approve(garbage)
+    assert refusal.outcome == StepResult.REFUSED
+    assert "outside the workspace" in refusal.reason
+    assert operator.next("pick_place", said) == proposal
+    operator.node.destroy_publisher(somebody)
 
     total, steps_done = 0.0, 0
     for _ in range(MOST_PROPOSALS):

@@ -20,8 +20,10 @@ impl Write for Sparse {
     fn write(&mut self, buffer: &[u8]) -> io::Result<usize> {
         let (head, tail) = buffer.split_at(buffer.len().min(4096));
         self.0.write_all(head)?;
-        if tail.len() <= ZEROS.len() && tail == &ZEROS[..tail.len()] {
-            self.0.seek_relative(tail.len() as i64)?;
+        if (1..=ZEROS.len()).contains(&tail.len()) && tail == &ZEROS[..tail.len()] {
+            // The last byte is there, so that the file ends where it should.
+            self.0.seek_relative(tail.len() as i64 - 1)?;
+            self.0.write_all(&[0])?;
         } else {
             self.0.write_all(tail)?;
         }

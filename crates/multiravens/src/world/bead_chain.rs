@@ -105,6 +105,20 @@ impl World {
         chain
     }
 
+    /// Speed of the fastest bead of all chains; 0 when they sleep.
+    pub(super) fn fastest_bead_m_s(&self) -> f64 {
+        let beads = self.chains.iter().flat_map(|chain| &chain.beads);
+        let speeds = beads.map(|bead| {
+            let body = &self.physics.bodies[self.bodies[bead.0].handle];
+            if body.is_sleeping() {
+                0.0
+            } else {
+                f64::from(body.linvel().length())
+            }
+        });
+        speeds.fold(0.0, f64::max)
+    }
+
     /// The widest gap of the joints of all chains.
     pub fn widest_joint_error_m(&self) -> f64 {
         let errors = self.chains.iter().map(|chain| self.joint_error_m(chain));

@@ -25,6 +25,13 @@ use suction::Suction;
 /// Physics steps in a second of simulated time.
 pub const STEPS_PER_SECOND: u32 = 480;
 
+/// The engine's substeps of a step, at least and at most. Most when a chain's joint gapes further
+/// than this, ...
+const SUBSTEPS: (usize, usize) = (4, 16);
+const GAPING_M: f64 = 0.8e-3;
+/// ... else as many as keep a bead from moving further than this in one of them.
+const SUBSTEP_TRAVEL_M: f64 = 0.3e-3;
+
 /// Manifold points closer than this count as contact.
 const CONTACT_DISTANCE_M: f32 = 0.2e-3;
 
@@ -116,7 +123,6 @@ impl World {
         };
         let parameters = &mut physics.integration_parameters;
         parameters.dt = 1.0 / STEPS_PER_SECOND as f32;
-        parameters.num_solver_iterations = 4;
         // Tolerances for objects of centimetres, not metres.
         parameters.length_unit = 0.1;
         // Recycled contacts are stale by millimetres at this scale.
@@ -240,8 +246,24 @@ impl World {
     /// points out of the tool.
     pub fn step(&mut self, tip: &Isometry3<f64>) {
         self.suction.lead(&mut self.physics, tip);
+        self.physics.integration_parameters.num_solver_iterations = self.substeps();
         self.physics.step();
         self.steps += 1;
+    }
+
+    /// Enough for the next step to keep the joints of chains together, where they are pulled hard
+    /// or a bead is fast.
+    fn substeps(&self) -> usize {
+        let (least, most) = SUBSTEPS;
+        let speed_m_s = self.fastest_bead_m_s();
+        if speed_m_s == 0.0 {
+            least
+        } else if self.widest_joint_error_m() > GAPING_M {
+            most
+        } else {
+            let travel_m = speed_m_s / f64::from(STEPS_PER_SECOND);
+            ((travel_m / SUBSTEP_TRAVEL_M).ceil() as usize).clamp(least, most)
+        }
     }
 
     /// Simulated time.

@@ -10,7 +10,7 @@ from sctn_msgs.msg import StepConfirmation
 from cell_operator import Operator
 
 
-@pytest.mark.parametrize("goal_module", ["image_distance"])
+@pytest.mark.parametrize("goal_module", ["image_distance", "embedding"])
 def test_placing_is_completed_with_a_person_only_watching(start, operator: Operator, goal_module: str) -> None:
     launch = start(
         "sctn", "launch", "--problem", "placing", "--seed", 10000, "--goal-module", goal_module, "--operator", "watch",

@@ -244,7 +244,7 @@ pub(crate) fn head<'a, const N: usize>(
 }
 
 /// A value as JSON.
-pub(crate) fn json(value: &impl serde::Serialize) -> String {
+pub(crate) fn json<T: serde::Serialize>(value: &T) -> String {
     // Our own types have string keys and finite numbers only: nothing here can fail.
     serde_json::to_string(value).unwrap_or_default()
 }

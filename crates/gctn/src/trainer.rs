@@ -61,6 +61,17 @@ impl Trainer {
         })
     }
 
+    /// The same training, begun with the weights of a checkpoint of the same network instead of random ones.
+    pub fn starting_from(self, checkpoint: &Path) -> Result<Self, Error> {
+        let (file, saved, _) = checkpoint::open(checkpoint)?;
+        if saved != self.model.config {
+            let [saved, asked] = [&saved, &self.model.config].map(checkpoint::json);
+            return Err(file.error(format!("it is of the network {saved}, expected {asked}")));
+        }
+        file.fill(&self.model.parameters.entries)?;
+        Ok(self)
+    }
+
     /// The network's configuration.
     pub fn network(&self) -> &NetworkConfig {
         &self.model.config

@@ -15,6 +15,9 @@ pub struct Recipe {
     pub demonstrations: usize,
     /// The network.
     pub network: NetworkConfig,
+    /// Checkpoint of the same network whose weights the training begins with, instead of random ones; from where the command runs.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub start_from: Option<PathBuf>,
     /// How it is trained.
     pub training: TrainingConfig,
     /// Which step is drawn how often.

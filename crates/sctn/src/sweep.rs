@@ -214,6 +214,7 @@ impl Sweep {
                 conditioning: run.agent.conditioning(),
                 ..self.network.clone()
             },
+            start_from: None,
             training: TrainingConfig {
                 seed: run.seed,
                 steps: self.training.steps * modules as u64,

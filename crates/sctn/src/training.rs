@@ -62,7 +62,11 @@ impl Training {
                 path: directory.to_owned(),
             });
         } else {
-            Trainer::new(&recipe.network, &recipe.training)?
+            let trainer = Trainer::new(&recipe.network, &recipe.training)?;
+            match &recipe.start_from {
+                Some(checkpoint) => trainer.starting_from(checkpoint)?,
+                None => trainer,
+            }
         };
         let snapshots = directory.join("snapshots");
         std::fs::create_dir_all(&snapshots).map_err(|source| TrainingError::Io {
@@ -161,6 +165,7 @@ mod tests {
                     ..Compact::default()
                 }))
             },
+            start_from: None,
             training: TrainingConfig {
                 seed,
                 steps: 6,
@@ -243,6 +248,36 @@ mod tests {
             "stopped after step 5, resumed from 4"
         );
         assert!(whole != trained(1, None), "another seed");
+    }
+
+    #[test]
+    fn a_training_begins_with_the_weights_of_a_checkpoint() {
+        let folder = tempfile::tempdir().unwrap();
+        let mut first = Training::open(recipe(0), data(), folder.path(), false).unwrap();
+        let losses = first.advance().unwrap();
+        let card = ModelCard::new();
+        let snapshot = first.save_snapshot(&card).unwrap();
+        let open = |recipe: Recipe| {
+            let folder = tempfile::tempdir().unwrap();
+            Training::open(recipe, data(), folder.path(), false)
+        };
+        let onward = |start_from| Recipe {
+            start_from,
+            ..recipe(0)
+        };
+        // The same first samples: what the first step has learned is seen.
+        let again = open(onward(None)).unwrap().advance().unwrap();
+        assert_eq!(losses, again);
+        let further = open(onward(Some(snapshot.clone()))).unwrap().advance();
+        let further = further.unwrap();
+        assert!(
+            further.pick + further.place < losses.pick + losses.place,
+            "{losses:?} {further:?}"
+        );
+        let mut other = onward(Some(snapshot));
+        other.network.rotations = 4;
+        let error = open(other).unwrap_err().to_string();
+        assert!(error.contains("expected {"), "{error}");
     }
 
     #[test]

@@ -43,12 +43,15 @@ enum Access {
     Never,
 }
 
+/// Takes over what was checked, or says what is wrong with it.
+type TakeOver = dyn Fn(&Values) -> Result<(), InvalidParameter> + Send + Sync;
+
 /// The parameters of one node.
 pub(crate) struct ParameterStore {
     values: Mutex<Values>,
     declarations: BTreeMap<String, Declaration>,
     /// Checks all values, and makes the change known to the node.
-    take_over: Box<dyn Fn(&Values) -> Result<(), InvalidParameter> + Send + Sync>,
+    take_over: Box<TakeOver>,
     /// A `watch::Receiver` of the node's own type.
     newest: Box<dyn Any + Send + Sync>,
     configured: AtomicBool,

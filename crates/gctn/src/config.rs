@@ -544,13 +544,13 @@ pub struct EmbeddingTraining {
     pub warm_up_steps: u64,
     /// The same for all images of a demonstration.
     pub augmentation: Augmentation,
-    /// Standard deviation of the smooth displacement of an image against its other view [cells].
+    /// Standard deviation of the smooth displacement of an image against its other view.
     pub displacement_sigma_px: f64,
-    /// Edge of the cells within which that displacement is smooth [cells].
+    /// Edge of the cells within which that displacement is smooth.
     pub displacement_spacing_px: usize,
     /// Largest error of a colour of the other view, of 255.
     pub color_noise: f64,
-    /// Largest error of a height of the other view [m].
+    /// Largest error of a height of the other view.
     pub height_noise_m: f64,
     /// Threads of libtorch. Sums are split by thread: another number gives other last bits.
     pub threads: usize,

@@ -57,7 +57,7 @@ impl Node {
         Ok(nodes)
     }
 
-    /// Processor time so far [s].
+    /// Processor time so far, in s.
     fn processor_s(&self) -> Result<f64> {
         let fields = stat(self.pid).with_context(|| format!("{} has ended", self.name))?;
         let ticks = |index: usize| {

@@ -57,7 +57,7 @@ impl Default for SimWorkcellParameters {
     }
 }
 
-/// Times of the wall clock [s].
+/// Times of the wall clock, in s.
 const PERIOD: Range = Range::Float(0.001, 3600.0);
 /// Pins of the control box and the tool.
 const PIN: Range = Range::Integer(0, 17);

@@ -141,7 +141,7 @@ impl Limits {
     }
 }
 
-/// Times of the wall clock [s].
+/// Times of the wall clock, in s.
 const TIME: Range = Range::Float(0.001, 3600.0);
 /// Pins of the control box and the tool.
 const PIN: Range = Range::Integer(0, 17);

@@ -25,9 +25,6 @@ use crate::{
 /// How long a node that waits for the end of its work may take to tidy up.
 pub(crate) const GRACE: Duration = Duration::from_secs(2);
 
-/// How long a participant outlives its node, so that others hear of the end of its publishers.
-const FAREWELL: Duration = Duration::from_millis(200);
-
 /// Where to look for other nodes.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Network {
@@ -184,8 +181,6 @@ impl Context {
             if let Err(error) = &result {
                 error!("{error:#}");
             }
-            // What was published is taken back while the participant can still say so.
-            tokio::time::sleep(FAREWELL).await;
             node.stop();
             result
         };

@@ -82,15 +82,15 @@ class Cameras:
             )
         )
 
-    def publish(self, change: Change = lambda _: None, changed: str = "left", leave_out: str | None = None) -> Time:
-        """Publishes one view of each camera and returns their stamp. `change` alters the view of the camera `changed`."""
+    def publish(self, change: Change = lambda _: None, changed: str | None = "left", leave_out: str | None = None) -> Time:
+        """Publishes one view of each camera and returns their stamp. `change` alters the view of the camera `changed`, or of all."""
         self._seconds += 1
         stamp = Time(sec=self._seconds)
         for name, (colour, depth, info) in self._publishers.items():
             if name == leave_out:
                 continue
             view = good_view(Header(stamp=stamp, frame_id=optical_frame(name)))
-            if name == changed:
+            if changed in (name, None):
                 change(view)
             info.publish(view.info)
             depth.publish(view.depth)

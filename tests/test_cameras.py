@@ -2,14 +2,30 @@
 
 from __future__ import annotations
 
+import functools
 import math
 
 import numpy as np
 import pytest
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from sctn_msgs.msg import Heightmap
+from sensor_msgs.msg import CompressedImage, Image, PointCloud2
 
-from cameras import BOX_COLOUR, BOX_HEIGHT_M, HEIGHT, WIDTH, Cameras, Change, View, depth_pixels, image, set_depth
-from cell_operator import Operator
+from cameras import (
+    BOX_COLOUR,
+    BOX_HEIGHT_M,
+    CAMERA_HEIGHT_M,
+    FOCAL_PX,
+    HEIGHT,
+    WIDTH,
+    Cameras,
+    Change,
+    View,
+    depth_pixels,
+    image,
+    set_depth,
+)
+from cell_operator import EVENT, LATCHED, Operator
 from processes import Process, free_domain
 
 # Heights come from depths in f32 or whole millimetres.
@@ -30,12 +46,14 @@ def cameras(fusion: Process, operator_for_module: Operator) -> Cameras:
     return cameras
 
 
-def fused(operator: Operator, cameras: Cameras, change: Change = lambda _: None) -> Heightmap:
+def fused(
+    operator: Operator, cameras: Cameras, change: Change = lambda _: None, changed: str | None = "left"
+) -> Heightmap:
     """The heightmap of one set of views; they are sent again until one arrives, as images are best effort."""
     stamps = []
 
     def heightmap() -> Heightmap | None:
-        stamps.append(cameras.publish(change))
+        stamps.append(cameras.publish(change, changed))
         operator.spin(0.3)
         return next((made for made in reversed(operator.received["heightmap"]) if made.header.stamp in stamps), None)
 
@@ -79,6 +97,73 @@ def test_holes_in_the_depth_are_no_points(cameras, operator_for_module, hole: fl
     assert np.abs(heights(heightmap)[155:165, 75:85] - BOX_HEIGHT_M).max() < TOLERANCE_M
 
 
+@pytest.mark.parametrize(("encoding", "channels"), [("bgr8", [2, 1, 0]), ("rgba8", [0, 1, 2, 0]), ("bgra8", [2, 1, 0, 0])])
+def test_colours_are_read_in_every_order_with_padded_rows(cameras, operator_for_module, encoding: str, channels) -> None:
+    def reorder(view: View) -> None:
+        rgb = np.frombuffer(view.colour.data.tobytes(), dtype=np.uint8).reshape(HEIGHT, WIDTH, 3)
+        rows = rgb[:, :, channels].reshape(HEIGHT, -1)
+        padded = np.pad(rows, ((0, 0), (0, 13)), constant_values=77)
+        view.colour = image(view.colour.header, encoding, padded.shape[1], padded)
+
+    heightmap = fused(operator_for_module, cameras, reorder, None)
+    rgb = np.asarray(heightmap.rgb).reshape(320, 160, 3)
+    assert np.abs(rgb[160, 80].astype(int) - BOX_COLOUR).max() <= 1
+
+
+def test_depth_of_the_other_byte_order_with_padded_rows_gives_the_same_heights(cameras, operator_for_module) -> None:
+    def swap(view: View) -> None:
+        rows = depth_pixels(view).byteswap().view(np.uint8).reshape(HEIGHT, -1)
+        padded = np.pad(rows, ((0, 0), (0, 6)), constant_values=255)
+        view.depth = image(view.depth.header, "32FC1", padded.shape[1], padded)
+        view.depth.is_bigendian = 1
+
+    heightmap = fused(operator_for_module, cameras, swap, None)
+    assert np.abs(heights(heightmap)[155:165, 75:85] - BOX_HEIGHT_M).max() < TOLERANCE_M
+
+
+LENS = (0.3, -0.1, 0.004, -0.003, 0.02)
+
+
+def through_lens(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Where plumb_bob shows ideal points, as OpenCV documents it."""
+    k1, k2, p1, p2, k3 = LENS
+    square = x * x + y * y
+    radial = 1 + k1 * square + k2 * square**2 + k3 * square**3
+    return (
+        x * radial + 2 * p1 * x * y + p2 * (square + 2 * x * x),
+        y * radial + p1 * (square + 2 * y * y) + 2 * p2 * x * y,
+    )
+
+
+def test_a_camera_behind_a_lens_sees_the_box_where_the_others_do(cameras, operator_for_module) -> None:
+    rows, columns = np.mgrid[0:HEIGHT, 0:WIDTH]
+    seen_x, seen_y = (columns - (WIDTH - 1) / 2) / FOCAL_PX, (rows - (HEIGHT - 1) / 2) / FOCAL_PX
+    # The box in a corner of the image, where the lens moves it by a dozen cells.
+    inside = lambda x, y: (np.abs(x - 0.4) < 0.05) & (np.abs(y - 0.18) < 0.05)  # noqa: E731
+    ideal_x, ideal_y = seen_x.copy(), seen_y.copy()
+    for _ in range(100):
+        shown_x, shown_y = through_lens(ideal_x, ideal_y)
+        ideal_x, ideal_y = ideal_x + seen_x - shown_x, ideal_y + seen_y - shown_y
+    assert max(np.abs(shown_x - seen_x).max(), np.abs(shown_y - seen_y).max()) < 1e-9
+
+    def show(view: View, lens: bool) -> None:
+        box = inside(ideal_x, ideal_y) if lens else inside(seen_x, seen_y)
+        depth = np.where(box, CAMERA_HEIGHT_M - BOX_HEIGHT_M, CAMERA_HEIGHT_M).astype(np.float32)
+        colour = np.where(box[:, :, None], BOX_COLOUR, 120).astype(np.uint8)
+        set_depth(view, depth)
+        view.colour = image(view.colour.header, "rgb8", 3 * WIDTH, colour)
+        if lens:
+            view.info.d = list(LENS)
+
+    straight = heights(fused(operator_for_module, cameras, lambda view: show(view, False), None))
+    bent = heights(fused(operator_for_module, cameras, lambda view: show(view, view.info.header.frame_id.startswith("left")), None))
+    assert (straight > BOX_HEIGHT_M / 2).sum() > 500
+    # The same but for the edges of the box, in all three views.
+    assert (np.abs(straight - bent) > TOLERANCE_M).sum() < 100
+    all_bent = heights(fused(operator_for_module, cameras, lambda view: show(view, True), None))
+    assert (np.abs(straight - all_bent) > TOLERANCE_M).sum() < 200
+
+
 def wrong_size(view: View) -> None:
     view.depth.height, view.depth.width = HEIGHT // 2, WIDTH // 2
 
@@ -109,6 +194,15 @@ def intrinsics_that_are_no_number(view: View) -> None:
     view.info.k[2] = math.nan
 
 
+def unknown_lens(view: View) -> None:
+    view.info.distortion_model = "equidistant"
+    view.info.d = [0.1, 0.0, 0.0, 0.0]
+
+
+def lens_that_folds_the_image(view: View) -> None:
+    view.info.d = [-2.0, 0.0, 0.0, 0.0, 0.0]
+
+
 def unknown_frame(view: View) -> None:
     for message in (view.colour, view.depth, view.info):
         message.header.frame_id = "nowhere"
@@ -124,6 +218,8 @@ def unknown_frame(view: View) -> None:
         (colour_of_other_size, ["left/color"]),
         (no_focal_length, ["left/color/camera_info"]),
         (intrinsics_that_are_no_number, ["left/color/camera_info"]),
+        (unknown_lens, ["left/color/camera_info", "equidistant", "plumb_bob"]),
+        (lens_that_folds_the_image, ["left/color/camera_info", "distortion", "pixel"]),
         (unknown_frame, ["nowhere"]),
     ],
 )
@@ -175,3 +271,82 @@ def test_without_extrinsics_nothing_is_fused_and_the_camera_is_named(start) -> N
         assert all(made.views < 3 for made in operator.received["heightmap"])
         cameras.publish_extrinsics()
         assert fused(operator, cameras).views == 3
+
+
+def test_a_camera_that_stops_and_comes_back_is_in_the_diagnostics_and_others_go_on_where_asked_to(start) -> None:
+    other = free_domain()
+    start("camera_fusion", "--ros-args", "-p", "fuse_without_silent:=true", "-p", "camera_timeout_s:=1.0", domain=other)
+    with Operator(other) as operator:
+        states: dict[str, DiagnosticStatus] = {}
+        operator.node.create_subscription(
+            DiagnosticArray, "/diagnostics", lambda said: states.update({one.name: one for one in said.status}), EVENT
+        )
+
+        def said(level: bytes, words: str) -> bool:
+            state = states.get("/camera_fusion: camera right")
+            return state is not None and state.level == level and words in state.message
+
+        cameras = Cameras(operator)
+        cameras.wait_for_fusion()
+        cameras.publish_extrinsics()
+        assert fused(operator, cameras).views == 3
+
+        def without_right(views: int) -> bool:
+            cameras.publish(leave_out="right" if views == 2 else None)
+            operator.spin(0.2)
+            return operator.newest("heightmap").views == views
+
+        operator.until(lambda: without_right(2), "heightmap of two views", 20.0)
+        operator.until(lambda: without_right(2) and said(DiagnosticStatus.ERROR, "no colour and depth image"), "error", 10.0)
+        operator.until(lambda: without_right(3), "heightmap of three views", 20.0)
+        operator.until(lambda: without_right(3) and said(DiagnosticStatus.OK, "images arrive"), "recovery", 10.0)
+
+        def values(state: str) -> dict[str, str]:
+            return {value.key: value.value for value in states[f"/camera_fusion: {state}"].values}
+
+        # What was used, said once a second.
+        operator.until(lambda: values("fusion")["views"] == "3", "report of three views", 10.0)
+        assert float(values("fusion")["coverage"]) > 0.5
+        assert float(values("camera right")["last_used_color_stamp_s"]) == float(values("fusion")["stamp_s"])
+
+
+def test_a_calibration_file_says_where_the_cameras_are_without_tf(start, tmp_path) -> None:
+    file = tmp_path / "cell.yaml"
+    pose = "{translation_m: [0.5, 0.0, 1.0], rotation_xyzw: [0.7071067811865476, 0.7071067811865476, 0.0, 0.0]}"
+    file.write_text("cameras:\n" + "".join(f"  {name}: {pose}\n" for name in ("front", "left", "right")))
+    other = free_domain()
+    start("camera_fusion", "--ros-args", "-p", f"calibration:={file}", domain=other)
+    with Operator(other) as operator:
+        cameras = Cameras(operator)
+        cameras.wait_for_fusion()
+        assert np.abs(heights(fused(operator, cameras))[155:165, 75:85] - BOX_HEIGHT_M).max() < TOLERANCE_M
+    for spoiled, word in [(pose.replace("0.0, 0.0]}", "0.0, 0.5]}"), "left"), (pose.replace("translation_m", "place"), "place")]:
+        file.write_text(f"cameras:\n  left: {spoiled}\n")
+        refused = start("camera_fusion", "--ros-args", "-p", f"calibration:={file}", domain=other)
+        assert refused.wait(10.0) != 0
+        assert "cell.yaml" in refused.errors()
+        assert word in refused.errors()
+
+
+def test_every_view_of_the_heightmap_comes_to_who_listens(start) -> None:
+    other = free_domain()
+    start("camera_fusion", domain=other)
+    with Operator(other) as operator:
+        cameras = Cameras(operator)
+        cameras.wait_for_fusion()
+        cameras.publish_extrinsics()
+        heightmap = fused(operator, cameras)
+        # Who comes after the heightmap gets its views all the same.
+        views: dict[str, object] = {}
+        for kind, topic in [(PointCloud2, "heightmap/points"), (Image, "heightmap/image"), (CompressedImage, "heightmap/image/compressed")]:
+            operator.node.create_subscription(kind, topic, functools.partial(views.__setitem__, topic), LATCHED)
+        operator.until(lambda: len(views) == 3, "views of the heightmap", 20.0)
+        cloud = views["heightmap/points"]
+        points = np.frombuffer(cloud.data.tobytes(), dtype=np.dtype("<f4")).reshape(320, 160, 4)
+        assert np.array_equal(points[:, :, 2], heights(heightmap))
+        assert points[0, 0, 0] == pytest.approx(0.25 + 0.5 * 0.003125)
+        assert views["heightmap/image"].data.tobytes() == np.asarray(heightmap.rgb).tobytes()
+        compressed = views["heightmap/image/compressed"]
+        assert compressed.format == "png"
+        assert compressed.data.tobytes().startswith(b"\x89PNG")
+        assert {view.header.stamp.sec for view in views.values()} == {heightmap.header.stamp.sec}

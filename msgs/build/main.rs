@@ -7,10 +7,7 @@ mod type_hash;
 use std::path::Path;
 
 fn main() -> Result<(), Box<dyn std::error::Error>> {
-    for path in ["build", "msg", "srv", "action", "vendor"]
-        .iter()
-        .filter(|path| Path::new(path).exists())
-    {
+    for path in ["build", "msg", "srv", "action", "vendor"] {
         println!("cargo::rerun-if-changed={path}");
     }
     match interfaces() {

@@ -1,9 +1,10 @@
-//! Pinhole camera model.
+//! Camera model: a pinhole, behind a lens.
 
-use nalgebra::{Isometry3, Point2, Point3, Translation3, UnitQuaternion, Vector3};
+use crate::Distortion;
+use nalgebra::{Isometry3, Point2, Point3, Translation3, UnitQuaternion, Vector2, Vector3};
 use serde::{Deserialize, Serialize};
 
-/// Pinhole intrinsics, without distortion. Image point (u, v) runs right and down; pixel centres have
+/// Pinhole intrinsics and lens distortion. Image point (u, v) runs right and down; pixel centres have
 /// whole coordinates, as in ROS.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct Intrinsics {
@@ -19,6 +20,9 @@ pub struct Intrinsics {
     pub cx_px: f64,
     /// Principal point, y.
     pub cy_px: f64,
+    /// What the lens does to the image.
+    #[serde(default)]
+    pub distortion: Distortion,
 }
 
 impl Intrinsics {
@@ -30,6 +34,7 @@ impl Intrinsics {
         fy_px: 450.0,
         cx_px: 320.0,
         cy_px: 240.0,
+        distortion: Distortion::NONE,
     };
 
     /// Number of pixels.
@@ -41,13 +46,18 @@ impl Intrinsics {
         self.width * self.height
     }
 
-    /// The ray through an image point, in the optical frame: 1 long along the optical axis.
+    /// The ray through an image point, in the optical frame: 1 long along the optical axis. Not a number
+    /// where the lens shows nothing.
     pub fn ray(&self, image: &Point2<f64>) -> Vector3<f64> {
-        Vector3::new(
+        let seen = Vector2::new(
             (image.x - self.cx_px) / self.fx_px,
             (image.y - self.cy_px) / self.fy_px,
-            1.0,
-        )
+        );
+        let nothing = Vector2::repeat(f64::NAN);
+        self.distortion
+            .undistort(&seen)
+            .unwrap_or(nothing)
+            .push(1.0)
     }
 }
 
@@ -76,6 +86,21 @@ pub enum CameraError {
         actual: f64,
         /// What was expected.
         expected: &'static str,
+    },
+    /// The distortion leaves a part of the image without rays.
+    #[error(
+        "camera {camera}: the distortion {distortion:?} cannot be undone at pixel ({u_px}, {v_px}): \
+         expected one that shows what is further out further out"
+    )]
+    Distortion {
+        /// Name of the camera.
+        camera: String,
+        /// The coefficients.
+        distortion: Distortion,
+        /// A pixel without a ray.
+        u_px: f64,
+        /// A pixel without a ray.
+        v_px: f64,
     },
     /// The pose has a part that is not finite.
     #[error("camera {camera}: the pose in the world is not finite")]
@@ -113,6 +138,7 @@ impl Camera {
             fy_px,
             cx_px,
             cy_px,
+            distortion,
         } = self.intrinsics;
         // 1 to 2^16: any real camera, and products that cannot overflow.
         let size = |size: usize| (1..=1 << 16).contains(&size);
@@ -135,6 +161,23 @@ impl Camera {
                 });
             }
         }
+        if !distortion.is_none() {
+            let (right, bottom) = ((width - 1) as f64, (height - 1) as f64);
+            for (u_px, v_px) in [0.0, 0.5, 1.0]
+                .into_iter()
+                .flat_map(|u| [0.0, 0.5, 1.0].map(|v| (u * right, v * bottom)))
+            {
+                let ray = self.intrinsics.ray(&Point2::new(u_px, v_px));
+                if !(distortion.is_finite() && ray.iter().all(|part| part.is_finite())) {
+                    return Err(CameraError::Distortion {
+                        camera: self.name.clone(),
+                        distortion,
+                        u_px,
+                        v_px,
+                    });
+                }
+            }
+        }
         let pose = &self.world_from_camera;
         let translation = pose.translation.vector.iter();
         let mut parts = translation.chain(pose.rotation.coords.iter());
@@ -151,23 +194,30 @@ impl Camera {
         self.world_from_camera * Point3::from(self.intrinsics.ray(image) * depth_m)
     }
 
-    /// Image point and depth of a world point, if it is before the camera.
+    /// Image point and depth of a world point, if it is before the camera and the lens shows it.
     pub fn project(&self, point: &Point3<f64>) -> Option<(Point2<f64>, f64)> {
         let point = self.world_from_camera.inverse_transform_point(point);
+        if point.z <= 0.0 {
+            return None;
+        }
         let Intrinsics {
             fx_px,
             fy_px,
             cx_px,
             cy_px,
+            distortion,
             ..
         } = self.intrinsics;
-        (point.z > 0.0).then(|| {
-            let image = Point2::new(
+        let image = if distortion.is_none() {
+            Point2::new(
                 fx_px * point.x / point.z + cx_px,
                 fy_px * point.y / point.z + cy_px,
-            );
-            (image, point.z)
-        })
+            )
+        } else {
+            let seen = distortion.distort(&(point.xy().coords / point.z))?;
+            Point2::new(fx_px * seen.x + cx_px, fy_px * seen.y + cy_px)
+        };
+        Some((image, point.z))
     }
 }
 
@@ -233,7 +283,59 @@ mod tests {
         }
     }
 
+    /// A consumer RGB-D camera, calibrated.
+    const LENS: Distortion = Distortion {
+        k1: 0.12,
+        k2: -0.24,
+        p1: 0.0011,
+        p2: -0.0007,
+        k3: 0.09,
+    };
+
+    #[test]
+    fn a_distortion_that_cannot_be_undone_in_the_image_is_refused_with_a_pixel() {
+        let mut camera = Camera::ravens()[0].clone();
+        camera.intrinsics.distortion = LENS;
+        assert_eq!(camera.check(), Ok(()));
+        for distortion in [
+            Distortion {
+                k1: -0.9,
+                ..Distortion::NONE
+            },
+            Distortion {
+                p1: f64::NAN,
+                ..Distortion::NONE
+            },
+        ] {
+            camera.intrinsics.distortion = distortion;
+            let error = camera.check().unwrap_err().to_string();
+            assert!(
+                error.contains("camera front") && error.contains("pixel (0, 0)"),
+                "{error}"
+            );
+        }
+    }
+
     proptest! {
+        #[test]
+        fn behind_a_lens_projection_undoes_back_projection_too(
+            u_px in 0.0..639.0, v_px in 0.0..479.0, depth_m in 0.01..10.0, which in 0usize..3,
+        ) {
+            let mut camera = Camera::ravens()[which].clone();
+            camera.intrinsics.distortion = LENS;
+            let image = Point2::new(u_px, v_px);
+            let point = camera.back_project(&image, depth_m);
+            let (again, depth_again_m) = camera.project(&point).unwrap();
+            prop_assert!((again - image).amax() < 1e-8);
+            prop_assert!((depth_again_m - depth_m).abs() < 1e-10);
+            // And the lens matters.
+            let mut pinhole = camera.clone();
+            pinhole.intrinsics.distortion = Distortion::NONE;
+            let (straight, _) = pinhole.project(&point).unwrap();
+            let from_axis = (image - Point2::new(320.0, 240.0)).norm();
+            prop_assert!((straight - image).norm() > 0.2 || from_axis < 120.0 || from_axis > 300.0);
+        }
+
         #[test]
         fn projection_undoes_back_projection(
             u_px in 0.0..640.0, v_px in 0.0..480.0, depth_m in 0.01..10.0, which in 0usize..3,

@@ -68,6 +68,30 @@ pub struct Fusion {
     heights: Vec<u32>,
     /// 0, 1, 2, ...
     columns: Vec<f32>,
+    /// By view, the rays of the last camera behind a lens.
+    lenses: Vec<LensRays>,
+}
+
+/// Rays of the pixels of a camera, without distortion.
+#[derive(Debug)]
+struct LensRays {
+    of: Intrinsics,
+    /// x and y where z is 1, row-major; not a number where the lens shows nothing.
+    rays: Vec<[f32; 2]>,
+}
+
+impl LensRays {
+    fn new(of: Intrinsics) -> Self {
+        let ray = |index: usize| {
+            let image = Point2::new((index % of.width) as f64, (index / of.width) as f64);
+            let ray = of.ray(&image);
+            [ray.x as f32, ray.y as f32]
+        };
+        Self {
+            of,
+            rays: (0..of.len()).map(ray).collect(),
+        }
+    }
 }
 
 /// The cell of points off the grid.
@@ -139,6 +163,7 @@ impl Fusion {
             fy_px,
             cx_px,
             cy_px,
+            ..
         } = view.camera.intrinsics;
         self.cells.resize(width, 0);
         self.heights.resize(width, 0);
@@ -153,9 +178,29 @@ impl Fusion {
         let origin = to_cells(pose.translation.vector - corner).cast::<f32>();
         let per_column =
             to_cells(pose.rotation * Vector3::new(1.0 / fx_px, 0.0, 0.0)).cast::<f32>();
+        let per_row = to_cells(pose.rotation * Vector3::new(0.0, 1.0, 0.0)).cast::<f32>();
+        let ahead = to_cells(pose.rotation * Vector3::new(0.0, 0.0, 1.0)).cast::<f32>();
+        let beside = to_cells(pose.rotation * Vector3::new(1.0, 0.0, 0.0)).cast::<f32>();
         let (cols, rows) = (workspace.cols as f32, workspace.rows as f32);
         let (z_min_m, z_max_m) = (workspace.z_min_m as f32, workspace.z_max_m as f32);
-        let outline = Outline::new(view.camera, workspace);
+        // Cell and ordered height of a point of this depth.
+        let place = |depth_m: f32, x: f32, y: f32, z_m: f32| {
+            // A depth that is not a number fails every comparison.
+            let inside = (depth_m > 0.0)
+                & (x >= 0.0)
+                & (x < cols)
+                & (y >= 0.0)
+                & (y < rows)
+                & (z_m >= z_min_m)
+                & (z_m <= z_max_m);
+            let index = whole(floor(y) * cols + floor(x));
+            (if inside { index } else { OUTSIDE }, ordered(z_m))
+        };
+        let lens = lens(&mut self.lenses, index, &view.camera.intrinsics);
+        let outline = match lens {
+            Some(_) => Outline { edges: None },
+            None => Outline::new(view.camera, workspace),
+        };
         for v in 0..height {
             // Most pixels see only what is beside the workspace.
             let columns = outline.columns(v, width);
@@ -164,22 +209,27 @@ impl Fusion {
             let pixels = v * width + columns.start..v * width + columns.end;
             let depths = &view.depth_m[pixels.clone()];
             // Two loops, since this one can be done for several pixels at once and the next cannot.
-            let row = self.cells.iter_mut().zip(&mut self.heights);
-            for (((cell, ordered_z), &depth_m), &u) in row.zip(depths).zip(&self.columns[columns]) {
-                let x = depth_m * (u * per_column.x + start.x) + origin.x;
-                let y = depth_m * (u * per_column.y + start.y) + origin.y;
-                let z_m = depth_m * (u * per_column.z + start.z) + origin.z;
-                // A depth that is not a number fails every comparison.
-                let inside = (depth_m > 0.0)
-                    & (x >= 0.0)
-                    & (x < cols)
-                    & (y >= 0.0)
-                    & (y < rows)
-                    & (z_m >= z_min_m)
-                    & (z_m <= z_max_m);
-                let index = whole(floor(y) * cols + floor(x));
-                *cell = if inside { index } else { OUTSIDE };
-                *ordered_z = ordered(z_m);
+            let row = self.cells.iter_mut().zip(&mut self.heights).zip(depths);
+            match lens {
+                None => {
+                    for (((cell, ordered_z), &depth_m), &u) in row.zip(&self.columns[columns]) {
+                        let x = depth_m * (u * per_column.x + start.x) + origin.x;
+                        let y = depth_m * (u * per_column.y + start.y) + origin.y;
+                        let z_m = depth_m * (u * per_column.z + start.z) + origin.z;
+                        (*cell, *ordered_z) = place(depth_m, x, y, z_m);
+                    }
+                }
+                Some(rays) => {
+                    for (((cell, ordered_z), &depth_m), [right, down]) in
+                        row.zip(&rays[pixels.clone()])
+                    {
+                        let at = |axis: usize| {
+                            let ray = right * beside[axis] + down * per_row[axis] + ahead[axis];
+                            depth_m * ray + origin[axis]
+                        };
+                        (*cell, *ordered_z) = place(depth_m, at(0), at(1), at(2));
+                    }
+                }
             }
             let colors = view.rgb[3 * pixels.start..3 * pixels.end].chunks_exact(3);
             for ((&cell, &z), color) in self.cells.iter().zip(&self.heights).zip(colors) {
@@ -190,6 +240,28 @@ impl Fusion {
             }
         }
     }
+}
+
+/// The rays of a view's camera if it is behind a lens, computed when its calibration changes.
+fn lens<'a>(
+    lenses: &'a mut Vec<LensRays>,
+    view: usize,
+    intrinsics: &Intrinsics,
+) -> Option<&'a [[f32; 2]]> {
+    if intrinsics.distortion.is_none() {
+        return None;
+    }
+    while lenses.len() <= view {
+        lenses.push(LensRays {
+            of: Intrinsics::RAVENS,
+            rays: Vec::new(),
+        });
+    }
+    let known = &mut lenses[view];
+    if known.of != *intrinsics {
+        *known = LensRays::new(*intrinsics);
+    }
+    Some(&known.rays)
 }
 
 /// The outline of a workspace on an image.
@@ -329,7 +401,7 @@ impl View<'_> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::Pixel;
+    use crate::{Distortion, Pixel};
     use nalgebra::{Isometry3, Translation3, UnitQuaternion};
     use proptest::prelude::*;
 
@@ -340,6 +412,15 @@ mod tests {
         fy_px: 40.0,
         cx_px: 20.0,
         cy_px: 15.0,
+        distortion: Distortion::NONE,
+    };
+
+    const LENS: Distortion = Distortion {
+        k1: 0.12,
+        k2: -0.24,
+        p1: 0.011,
+        p2: -0.007,
+        k3: 0.09,
     };
 
     /// Looks straight down from a metre above a point; the image's x runs along the world's x.
@@ -569,8 +650,15 @@ mod tests {
             ..Workspace::RAVENS
         };
         let mut used = Fusion::default();
+        let mut bent = small.clone();
+        bent.intrinsics.distortion = LENS;
+        let through_lens = View {
+            camera: &bent,
+            ..view
+        };
         for (workspace, views) in [
             (Workspace::RAVENS, vec![view; 3]),
+            (Workspace::RAVENS, vec![view, through_lens]),
             (coarse, vec![view]),
             (Workspace::RAVENS, vec![]),
             (Workspace::RAVENS, vec![view; 2]),
@@ -590,8 +678,12 @@ mod tests {
         fn fusion_agrees_with_its_definition(
             depths in prop::collection::vec(0.85f32..1.05, 1200),
             x_m in 0.3..0.7, y_m in -0.4..0.4, yaw_rad in -3.0..3.0, tilt_rad in -0.5..0.5,
+            behind_a_lens: bool,
         ) {
             let mut camera = above(x_m, y_m);
+            if behind_a_lens {
+                camera.intrinsics.distortion = LENS;
+            }
             let turn = UnitQuaternion::from_euler_angles(tilt_rad, 0.0, yaw_rad);
             camera.world_from_camera.rotation = turn * camera.world_from_camera.rotation;
             let rgb: Vec<u8> = (0..3600).map(|i| (i * 7 % 251) as u8).collect();

@@ -5,11 +5,13 @@
 //! (0, 0) lies at the corner of the smallest x and y.
 
 mod camera;
+mod distortion;
 mod fusion;
 pub mod picture;
 mod workspace;
 
 pub use camera::{Camera, CameraError, Intrinsics};
+pub use distortion::Distortion;
 pub use fusion::{Fusion, FusionError, FusionReport, View};
 pub use workspace::{Heightmap, HeightmapError, Pixel, Workspace, WorkspaceError};
 

@@ -292,6 +292,7 @@ fn one_rasteriser_draws_images_of_any_size_in_turn() {
         fy_px: 25.0,
         cx_px: 16.0,
         cy_px: 8.0,
+        ..Intrinsics::RAVENS
     };
     for camera in [&Camera::ravens()[0], &small, &Camera::ravens()[2]] {
         let mut image = RgbdImage::new(&camera.intrinsics);
@@ -434,6 +435,7 @@ fn quick() -> Camera {
         fy_px: 112.5,
         cx_px: 80.0,
         cy_px: 60.0,
+        ..Intrinsics::RAVENS
     };
     camera
 }

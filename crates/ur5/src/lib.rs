@@ -6,4 +6,4 @@ mod work_cell;
 
 pub use arm::{Arm, DhLengths, Joints, Solutions, Unreachable};
 pub use trajectory::{JointTrajectory, PlanError, Sampler, TrajectoryPoint};
-pub use work_cell::{Body, Shape, WorkCell, WorkCellError};
+pub use work_cell::{Body, Frame, Shape, WorkCell, WorkCellError};

@@ -19,6 +19,31 @@ pub struct WorkCell {
     pub visuals: Vec<Body>,
     /// What collides, in the order of the URDF.
     pub collisions: Vec<Body>,
+    /// Where each link but the root hangs, in the order of the URDF.
+    pub frames: Vec<Frame>,
+    /// The URDF itself, for who draws the cell.
+    pub urdf: String,
+}
+
+/// A link as a frame on the link below.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Frame {
+    /// Name of the link below.
+    pub parent: String,
+    /// Name of the link.
+    pub child: String,
+    /// Which of the arm's joints moves it, 0 to 5; none when it is fixed.
+    pub joint: Option<usize>,
+    /// Pose on the link below, where that joint is at 0.
+    pub origin: Isometry3<f64>,
+}
+
+impl Frame {
+    /// Pose on the link below at a joint position.
+    pub fn pose(&self, joints: &Joints) -> Isometry3<f64> {
+        let angle_rad = self.joint.map_or(0.0, |joint| joints[joint]);
+        self.origin * UnitQuaternion::from_axis_angle(&Vector3::z_axis(), angle_rad)
+    }
 }
 
 /// A primitive shape, centred on its frame; lengths in m.
@@ -156,13 +181,13 @@ impl WorkCell {
             path: path.into(),
             reason: error.to_string(),
         })?;
-        Self::from_robot(&robot).map_err(|expected| WorkCellError::Missing {
+        Self::from_robot(&robot, text).map_err(|expected| WorkCellError::Missing {
             path: path.into(),
             expected,
         })
     }
 
-    fn from_robot(robot: &urdf_rs::Robot) -> Result<Self, String> {
+    fn from_robot(robot: &urdf_rs::Robot, text: &str) -> Result<Self, String> {
         let tree = Tree::new(robot)?;
         let arm_joints = tree.arm_joints()?;
         let arm = read_arm(&tree, &arm_joints)?;
@@ -172,7 +197,17 @@ impl WorkCell {
             cameras: Vec::new(),
             visuals: Vec::new(),
             collisions: Vec::new(),
+            frames: Vec::new(),
+            urdf: text.to_owned(),
         };
+        for joint in &robot.joints {
+            cell.frames.push(Frame {
+                parent: joint.parent.link.clone(),
+                child: joint.child.link.clone(),
+                joint: cell.joint_names.iter().position(|name| *name == joint.name),
+                origin: read_pose(&joint.origin, &joint.name)?,
+            });
+        }
         let mut colors = BTreeMap::new();
         for material in &robot.materials {
             if let Some(color) = &material.color {
@@ -213,6 +248,16 @@ impl WorkCell {
             return Err("no link NAME_camera_optical_frame, expected at least one camera".into());
         }
         Ok(cell)
+    }
+
+    /// Name of the link that all others hang on.
+    pub fn root(&self) -> &str {
+        let is_child = |link: &str| self.frames.iter().any(|frame| frame.child == link);
+        let parents = self.frames.iter().map(|frame| frame.parent.as_str());
+        parents
+            .filter(|parent| !is_child(parent))
+            .next_back()
+            .unwrap_or_default()
     }
 
     /// What is seen and where in the world at a joint position, for rendering.

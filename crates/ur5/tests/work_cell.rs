@@ -374,3 +374,29 @@ fn what_is_wrong_with_a_urdf_is_named() {
         .to_string();
     assert!(error.starts_with("no/such.urdf: "), "{error}");
 }
+
+#[test]
+fn the_frames_of_the_links_lead_from_the_world_to_the_tip() {
+    let cell = cell();
+    assert_eq!(cell.root(), "world");
+    assert_eq!(
+        cell.frames
+            .iter()
+            .filter(|frame| frame.joint.is_some())
+            .count(),
+        6
+    );
+    for joints in [cell.arm.home, cell.arm.ready, Joints::repeat(0.3)] {
+        let (mut at, mut pose) = ("suction_tip", Isometry3::identity());
+        while at != "world" {
+            let frame = cell.frames.iter().find(|frame| frame.child == at).unwrap();
+            pose = frame.pose(&joints) * pose;
+            at = &frame.parent;
+        }
+        let apart = pose.inv_mul(&cell.arm.tip(&joints));
+        assert!(
+            apart.translation.vector.norm() < 1e-9 && apart.rotation.angle() < 1e-9,
+            "{apart}"
+        );
+    }
+}

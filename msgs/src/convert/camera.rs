@@ -3,7 +3,7 @@
 use super::ConvertError;
 use super::error::{all_finite, positive, size, unexpected};
 use crate::{sensor_msgs, std_msgs};
-use ::heightmap::Intrinsics;
+use ::heightmap::{Distortion, Intrinsics};
 use serde_bytes::ByteBuf;
 
 /// Rows of an image without their padding, once the sizes are right.
@@ -40,8 +40,8 @@ fn rows<'a>(
         .map(move |row| &row[..row_bytes]))
 }
 
-/// Colour of an image of encoding rgb8, bgr8, rgba8 or bgra8 as red, green, blue, row-major, without padding.
-/// Its size must be that of `expected`. `rgb` is overwritten.
+/// Colour of an image of encoding rgb8, bgr8, rgba8, bgra8 or mono8 (grey) as red, green, blue, row-major, without
+/// padding. Its size must be that of `expected`. `rgb` is overwritten.
 pub fn color_from_msg(
     image: &sensor_msgs::Image,
     expected: &Intrinsics,
@@ -74,11 +74,13 @@ pub fn color_from_msg(
                     .flat_map(|&[b, g, r, _]| [r, g, b]),
             )
         }),
+        "mono8" => rows(image, expected, 1)?
+            .for_each(|row| rgb.extend(row.iter().flat_map(|&grey| [grey; 3]))),
         other => {
             return Err(unexpected(
                 "encoding",
                 format!("{other:?}"),
-                "rgb8, bgr8, rgba8 or bgra8",
+                "rgb8, bgr8, rgba8, bgra8 or mono8",
             ));
         }
     }
@@ -213,27 +215,48 @@ pub fn depth_to_msg_mm(
     )
 }
 
-/// Pinhole intrinsics of a rectified, full-size image: no distortion, no binning, no region of interest.
+/// Lens distortion of a calibration: model plumb_bob, or none.
+fn distortion_from_msg(info: &sensor_msgs::CameraInfo) -> Result<Distortion, ConvertError> {
+    all_finite("d", &info.d)?;
+    let too_many = |expected: &'static str| unexpected("d", format!("{:?}", info.d), expected);
+    match (info.distortion_model.as_str(), info.d.as_slice()) {
+        ("plumb_bob", []) => Ok(Distortion::NONE),
+        ("plumb_bob", &[k1, k2, p1, p2]) => Ok(Distortion {
+            k1,
+            k2,
+            p1,
+            p2,
+            k3: 0.0,
+        }),
+        ("plumb_bob", &[k1, k2, p1, p2, k3]) => Ok(Distortion { k1, k2, p1, p2, k3 }),
+        ("plumb_bob", _) => Err(too_many("k1, k2, p1, p2 and k3 of plumb_bob")),
+        // A driver that does not know, or has none to tell.
+        ("", d) if d.iter().all(|coefficient| *coefficient == 0.0) => Ok(Distortion::NONE),
+        // The polynomial in the denominator is 1.
+        ("rational_polynomial", &[k1, k2, p1, p2, k3, k4, k5, k6]) if [k4, k5, k6] == [0.0; 3] => {
+            Ok(Distortion { k1, k2, p1, p2, k3 })
+        }
+        (other, _) => Err(unexpected(
+            "distortion_model",
+            format!("{other:?} with d {:?}", info.d),
+            "\"plumb_bob\"",
+        )),
+    }
+}
+
+/// Intrinsics of a full-size image, with distortion after plumb_bob: no binning, no region of interest.
 pub fn intrinsics_from_msg(info: &sensor_msgs::CameraInfo) -> Result<Intrinsics, ConvertError> {
     let at_least_one = |field, value: u32| match value {
         0 => Err(unexpected(field, 0, "at least 1")),
         _ => Ok(value as usize),
     };
     all_finite("k", &info.k)?;
-    all_finite("d", &info.d)?;
     let [fx, skew, cx, zero_10, fy, cy, zero_20, zero_21, one] = info.k;
     if [skew, zero_10, zero_20, zero_21, one] != [0.0, 0.0, 0.0, 0.0, 1.0] {
         return Err(unexpected(
             "k",
             format!("{:?}", info.k),
             "[fx, 0, cx, 0, fy, cy, 0, 0, 1]",
-        ));
-    }
-    if info.d.iter().any(|coefficient| *coefficient != 0.0) {
-        return Err(unexpected(
-            "d",
-            format!("{:?}", info.d),
-            "no distortion: the topic of rectified images",
         ));
     }
     let identity = [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0];
@@ -262,10 +285,11 @@ pub fn intrinsics_from_msg(info: &sensor_msgs::CameraInfo) -> Result<Intrinsics,
         fy_px: positive("k[4]", fy)?,
         cx_px: cx,
         cy_px: cy,
+        distortion: distortion_from_msg(info)?,
     })
 }
 
-/// Calibration of a camera without distortion (plumb_bob with zeros).
+/// Calibration of a camera.
 pub fn intrinsics_to_msg(header: std_msgs::Header, camera: &Intrinsics) -> sensor_msgs::CameraInfo {
     let Intrinsics {
         width,
@@ -274,13 +298,14 @@ pub fn intrinsics_to_msg(header: std_msgs::Header, camera: &Intrinsics) -> senso
         fy_px: fy,
         cx_px: cx,
         cy_px: cy,
+        distortion: Distortion { k1, k2, p1, p2, k3 },
     } = *camera;
     sensor_msgs::CameraInfo {
         header,
         height: height as u32,
         width: width as u32,
         distortion_model: "plumb_bob".to_owned(),
-        d: vec![0.0; 5],
+        d: vec![k1, k2, p1, p2, k3],
         k: [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0],
         r: [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0],
         p: [fx, 0.0, cx, 0.0, 0.0, fy, cy, 0.0, 0.0, 0.0, 1.0, 0.0],
@@ -299,6 +324,7 @@ mod tests {
         fy_px: 440.0,
         cx_px: 1.0,
         cy_px: 0.5,
+        distortion: Distortion::NONE,
     };
 
     fn padded(encoding: &str, is_bigendian: u8, step: u32, data: &[u8]) -> sensor_msgs::Image {
@@ -311,6 +337,18 @@ mod tests {
             data: ByteBuf::from(data.to_vec()),
             ..Default::default()
         }
+    }
+
+    #[test]
+    fn grey_images_have_their_grey_in_every_colour() {
+        let mut rgb = Vec::new();
+        color_from_msg(
+            &padded("mono8", 0, 3, &[1, 2, 0, 3, 4, 0]),
+            &CAMERA,
+            &mut rgb,
+        )
+        .unwrap();
+        assert_eq!(rgb, [1, 1, 1, 2, 2, 2, 3, 3, 3, 4, 4, 4]);
     }
 
     #[test]
@@ -400,7 +438,7 @@ mod tests {
                 encoding: "yuv422".into(),
                 ..good.clone()
             }),
-            "encoding is \"yuv422\", expected rgb8, bgr8, rgba8 or bgra8"
+            "encoding is \"yuv422\", expected rgb8, bgr8, rgba8, bgra8 or mono8"
         );
         assert_eq!(
             refusal(sensor_msgs::Image {
@@ -421,14 +459,64 @@ mod tests {
     }
 
     #[test]
-    fn calibrations_beyond_the_pinhole_model_are_refused() {
+    fn the_distortion_of_a_calibration_is_read() {
+        let lens = Distortion {
+            k1: 0.1,
+            k2: -0.2,
+            p1: 0.003,
+            p2: -0.004,
+            k3: 0.05,
+        };
+        let camera = Intrinsics {
+            distortion: lens,
+            ..CAMERA
+        };
+        let mut info = intrinsics_to_msg(Default::default(), &camera);
+        assert_eq!(intrinsics_from_msg(&info).unwrap(), camera);
+        info.distortion_model = "rational_polynomial".into();
+        info.d.extend([0.0; 3]);
+        assert_eq!(intrinsics_from_msg(&info).unwrap(), camera);
+        info.d[7] = 0.1;
+        assert!(intrinsics_from_msg(&info).is_err());
+        // Four coefficients are three radial ones less.
+        info.distortion_model = "plumb_bob".into();
+        info.d.truncate(4);
+        let read = intrinsics_from_msg(&info).unwrap().distortion;
+        assert_eq!(read, Distortion { k3: 0.0, ..lens });
+        // None, in the ways in which drivers say so.
+        info.d.clear();
+        assert!(intrinsics_from_msg(&info).unwrap().distortion.is_none());
+        info.distortion_model.clear();
+        assert!(intrinsics_from_msg(&info).unwrap().distortion.is_none());
+    }
+
+    #[test]
+    fn calibrations_beyond_the_model_are_refused() {
         let good = intrinsics_to_msg(Default::default(), &CAMERA);
         let refusal = |spoil: fn(&mut sensor_msgs::CameraInfo)| {
             let mut info = good.clone();
             spoil(&mut info);
             intrinsics_from_msg(&info).unwrap_err().to_string()
         };
-        assert!(refusal(|info| info.d[1] = 0.1).starts_with("d is"));
+        assert!(refusal(|info| info.d[1] = f64::NAN).starts_with("d[1] is not finite"));
+        assert!(refusal(|info| info.d.push(0.1)).starts_with("d is"));
+        assert!(refusal(|info| info.d.truncate(2)).starts_with("d is"));
+        for model in ["equidistant", "rational_polynomial", "fisheye"] {
+            let mut info = good.clone();
+            info.distortion_model = model.to_owned();
+            let error = intrinsics_from_msg(&info).unwrap_err().to_string();
+            assert!(
+                error.starts_with("distortion_model is") && error.contains(model),
+                "{error}"
+            );
+        }
+        assert!(
+            refusal(|info| {
+                info.distortion_model.clear();
+                info.d[0] = 0.1;
+            })
+            .starts_with("distortion_model is \"\"")
+        );
         assert!(refusal(|info| info.k[1] = 0.1).starts_with("k is"));
         assert!(refusal(|info| info.k[0] = f64::NAN).starts_with("k[0] is not finite"));
         assert!(refusal(|info| info.k[4] = -1.0).starts_with("k[4] is"));

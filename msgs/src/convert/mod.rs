@@ -18,8 +18,8 @@ pub use error::ConvertError;
 pub use heightmap::{header, heightmap_from_msg, heightmap_to_msg};
 pub use motion::{
     isometry_from_msg, isometry_to_msg, joint_state_to_msg, joint_trajectory_from_msg,
-    joint_trajectory_to_msg, joints_from_msg, outcome_from_msg, outcome_to_msg,
+    joint_trajectory_to_msg, joints_from_msg, outcome_from_msg, outcome_to_msg, phase_to_msg,
     pick_place_from_msg, pose2d_from_msg, pose2d_to_msg, settings_from_msg, settings_to_msg,
 };
-pub use preview::{grid_map, preview_image};
+pub use preview::{compressed_preview, grid_map, points, preview_image};
 pub use time::{duration_from_msg, duration_to_msg, time_from_msg, time_to_msg};

@@ -3,7 +3,7 @@
 use super::error::{all_finite, finite, positive, size, unexpected};
 use super::{ConvertError, duration_from_msg, duration_to_msg};
 use crate::{geometry_msgs, sctn_msgs, sensor_msgs, std_msgs, trajectory_msgs};
-use ::pick_place::{Outcome, PickPlace, PrimitiveSettings};
+use ::pick_place::{Outcome, Phase, PickPlace, PrimitiveSettings};
 use nalgebra::{Isometry2, Isometry3, Quaternion, Translation3, Unit, UnitComplex, UnitQuaternion};
 use std::f64::consts::{PI, TAU};
 use std::iter::successors;
@@ -91,6 +91,23 @@ pub fn outcome_to_msg(outcome: Outcome) -> u8 {
         Outcome::GraspFailed => StepResult::GRASP_FAILED,
         Outcome::Dropped => StepResult::DROPPED,
         Outcome::LagAborted => StepResult::LAG_ABORTED,
+    }
+}
+
+/// A constant of the feedback of `ExecutePickPlace`.
+pub fn phase_to_msg(phase: Phase) -> u8 {
+    use sctn_msgs::ExecutePickPlaceFeedback as Feedback;
+    match phase {
+        Phase::Approach => Feedback::APPROACH,
+        Phase::DescendToPick => Feedback::DESCEND_TO_PICK,
+        Phase::Grasp => Feedback::GRASP,
+        Phase::Lift => Feedback::LIFT,
+        Phase::CheckGrasp => Feedback::CHECK_GRASP,
+        Phase::Transfer => Feedback::TRANSFER,
+        Phase::DescendToPlace => Feedback::DESCEND_TO_PLACE,
+        Phase::Release => Feedback::RELEASE,
+        Phase::Retreat => Feedback::RETREAT,
+        Phase::Home => Feedback::HOME,
     }
 }
 

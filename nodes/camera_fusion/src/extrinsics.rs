@@ -247,6 +247,16 @@ mod tests {
     }
 
     #[test]
+    fn the_example_is_the_calibration_of_the_simulated_cell() {
+        let example = concat!(env!("CARGO_MANIFEST_DIR"), "/../../config/calibration.yaml");
+        let poses = read_calibration(Path::new(example)).unwrap();
+        for camera in heightmap::Camera::ravens() {
+            let apart = camera.world_from_camera.inv_mul(&poses[&camera.name]);
+            assert!(apart.translation.vector.norm() < 1e-9 && apart.rotation.angle() < 1e-9);
+        }
+    }
+
+    #[test]
     fn calibration_files_are_read_and_bad_ones_named() {
         let directory = tempfile::tempdir().unwrap();
         let path = directory.path().join("cell.yaml");

@@ -3,6 +3,7 @@
 //! What belongs together and what is wrong with it is decided in [`Views`], which knows no ROS node.
 
 mod extrinsics;
+mod outputs;
 mod parameters;
 mod views;
 
@@ -14,8 +15,6 @@ use std::{
 };
 
 use msgs::{
-    convert,
-    grid_map_msgs::GridMap,
     sctn_msgs,
     sensor_msgs::{CameraInfo, Image},
     tf2_msgs::TFMessage,
@@ -24,9 +23,11 @@ use node_kit::{Active, Level, Node, NodeError, Publisher, Qos, Statistics};
 use tokio::sync::mpsc;
 use tracing::{info, warn};
 
+use outputs::Outputs;
+
 pub use extrinsics::{CalibrationError, TransformError, Transforms, Unconnected, read_calibration};
 pub use parameters::{CameraFusionParameters, WorkspaceParameters};
-pub use views::{Complaint, Fused, Stream, Views};
+pub use views::{Complaint, Fused, Stream, Used, Views};
 
 /// Messages between their subscriptions and the fusion.
 const WAITING_ARRIVALS: usize = 32;
@@ -95,9 +96,11 @@ pub struct FusionNode {
     cameras: Vec<CameraTopics>,
     timeout: Duration,
     heightmap: Publisher<sctn_msgs::Heightmap>,
-    grid_map: Publisher<GridMap>,
-    preview: Publisher<Image>,
+    outputs: Outputs,
     last_fusion: Duration,
+    /// What the last heightmap was made from, by camera.
+    used: Vec<Option<Used>>,
+    last: Option<(Duration, u32, f32)>,
     fused: u64,
 }
 
@@ -123,9 +126,10 @@ impl FusionNode {
             cameras: Vec::new(),
             timeout: Duration::from_secs_f64(parameters.camera_timeout_s),
             heightmap: node.publisher("heightmap", Qos::Latched)?,
-            grid_map: node.publisher("heightmap/grid_map", Qos::Latched)?,
-            preview: node.publisher("heightmap/image", Qos::Latched)?,
+            outputs: Outputs::new(node)?,
             last_fusion: Duration::ZERO,
+            used: vec![None; parameters.cameras.len()],
+            last: None,
             fused: 0,
             parameters,
             poses,
@@ -227,17 +231,27 @@ impl FusionNode {
         }
     }
 
+    /// A camera that has fallen silent may have been all that was waited for.
+    fn fuse_what_is_left(&mut self) {
+        if self.views.fuses_without_silent() && self.cameras.iter().any(|camera| camera.silent) {
+            self.fuse();
+        }
+    }
+
     fn publish(&mut self, fused: Fused, start: Instant) {
-        let header = fused.message.header.clone();
-        self.heightmap.publish(fused.message);
+        let Fused {
+            heightmap,
+            message,
+            stamp,
+            used,
+        } = fused;
+        let header = message.header.clone();
+        self.last = Some((stamp, message.views, message.coverage));
+        self.used = used;
+        self.heightmap.publish(message);
         self.last_fusion = start.elapsed();
         self.fused += 1;
-        self.grid_map
-            .publish(convert::grid_map(&fused.heightmap, header.clone()));
-        match convert::preview_image(&fused.heightmap, header) {
-            Ok(image) => self.preview.publish(image),
-            Err(error) => self.preview.statistics().reject(error),
-        }
+        self.outputs.take(heightmap, header);
     }
 
     fn complain(&self, complaint: &Complaint) {
@@ -253,13 +267,14 @@ impl FusionNode {
     /// A camera is silent when nothing has come from it for the timeout while something has from
     /// another. When nothing comes from any, the cell is moving, or gone.
     fn look_for_silent_cameras(&mut self, node: &Node) {
+        self.outputs.look(node);
         let timeout = self.timeout;
         let recent = |arrival: Option<Instant>| arrival.is_some_and(|at| at.elapsed() <= timeout);
         let any = self
             .cameras
             .iter()
             .any(|camera| recent(camera.color_arrival) || recent(camera.depth_arrival));
-        for camera in &mut self.cameras {
+        for (index, camera) in self.cameras.iter_mut().enumerate() {
             let missing: Vec<&str> = [
                 ("colour", camera.color_arrival),
                 ("depth", camera.depth_arrival),
@@ -270,9 +285,13 @@ impl FusionNode {
             .collect();
             let silent = any && !missing.is_empty();
             if silent && !camera.silent {
+                let then = if self.views.fuses_without_silent() {
+                    "heightmaps are made without it"
+                } else {
+                    "no heightmap without it"
+                };
                 warn!(
-                    "camera {}: no {} image for {timeout:?} while other images arrive; no heightmap \
-                     without it",
+                    "camera {}: no {} image for {timeout:?} while other images arrive; {then}",
                     camera.name,
                     missing.join(" and ")
                 );
@@ -280,22 +299,41 @@ impl FusionNode {
                 info!("camera {}: images arrive again", camera.name);
             }
             camera.silent = silent || (camera.silent && !missing.is_empty());
+            self.views.set_silent(index, camera.silent);
             let (level, message) = match (missing.is_empty(), any) {
                 (true, _) => (Level::Ok, "images arrive".to_owned()),
                 (false, true) => (Level::Error, format!("no {} image", missing.join(" and "))),
                 (false, false) => (Level::Stale, "no camera sends images".to_owned()),
             };
-            node.diagnostics()
-                .set(format!("camera {}", camera.name), level, message, []);
+            let seconds = |stamp: Duration| format!("{:.9}", stamp.as_secs_f64());
+            let used = self.used[index].map(|used| {
+                [
+                    ("last_used_color_stamp_s", seconds(used.color)),
+                    ("last_used_depth_stamp_s", seconds(used.depth)),
+                ]
+            });
+            node.diagnostics().set(
+                format!("camera {}", camera.name),
+                level,
+                message,
+                used.into_iter().flatten(),
+            );
         }
+        let took_ms = format!("{:.2}", self.last_fusion.as_secs_f64() * 1e3);
+        let last = self.last.map(|(stamp, views, coverage)| {
+            [
+                ("stamp_s", format!("{:.9}", stamp.as_secs_f64())),
+                ("views", views.to_string()),
+                ("coverage", format!("{coverage:.4}")),
+                ("last_image_to_heightmap_ms", took_ms),
+            ]
+        });
         node.diagnostics().set(
             "fusion",
             Level::Ok,
             format!("{} heightmaps", self.fused),
-            [(
-                "last_image_to_heightmap_ms",
-                format!("{:.2}", self.last_fusion.as_secs_f64() * 1e3),
-            )],
+            last.into_iter().flatten(),
         );
+        self.fuse_what_is_left();
     }
 }

@@ -20,6 +20,7 @@ pub struct CameraFusionParameters {
     pub calibration: PathBuf,
     pub tolerance_s: f64,
     pub camera_timeout_s: f64,
+    pub fuse_without_silent: bool,
     pub workspace: WorkspaceParameters,
 }
 
@@ -45,6 +46,7 @@ impl Default for CameraFusionParameters {
             calibration: PathBuf::new(),
             tolerance_s: 0.02,
             camera_timeout_s: 2.0,
+            fuse_without_silent: false,
             workspace: WorkspaceParameters::default(),
         }
     }

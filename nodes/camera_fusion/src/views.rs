@@ -47,11 +47,14 @@ struct CameraState {
     name: String,
     /// From the calibration file, which wins over `/tf_static`.
     fixed_pose: Option<Isometry3<f64>>,
-    intrinsics: Option<Intrinsics>,
+    /// From the last calibration, or what is wrong with it.
+    intrinsics: Result<Intrinsics, String>,
     color: VecDeque<(Duration, Image)>,
     depth: VecDeque<(Duration, Image)>,
     rgb: Vec<u8>,
     depth_m: Vec<f32>,
+    /// Nothing has come for a while.
+    silent: bool,
 }
 
 /// Collects images and fuses those that belong together.
@@ -59,7 +62,7 @@ struct CameraState {
 /// A set of images belongs together when each camera has a colour and a depth image whose stamps are
 /// within `tolerance_s` of one reference stamp. The reference is the newest colour stamp for which that
 /// holds; of several images of a stream the nearest is taken. A set is fused once: it must be newer than
-/// the last one.
+/// the last one. A silent camera is waited for, unless `fuse_without_silent`.
 pub struct Views {
     cameras: Vec<CameraState>,
     transforms: Transforms,
@@ -68,6 +71,16 @@ pub struct Views {
     fusion: Fusion,
     heightmap: Heightmap,
     last: Option<Duration>,
+    fuse_without_silent: bool,
+}
+
+/// Stamps of the images of one camera in a heightmap.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Used {
+    /// Of the colour image.
+    pub color: Duration,
+    /// Of the depth image.
+    pub depth: Duration,
 }
 
 /// A heightmap and what it was made from.
@@ -77,6 +90,10 @@ pub struct Fused {
     pub heightmap: Heightmap,
     /// To be published.
     pub message: sctn_msgs::Heightmap,
+    /// Of the newest image.
+    pub stamp: Duration,
+    /// By camera; nothing where it was left out.
+    pub used: Vec<Option<Used>>,
 }
 
 impl Views {
@@ -93,11 +110,12 @@ impl Views {
         let state = |name: &String| CameraState {
             name: name.clone(),
             fixed_pose: poses.remove(name),
-            intrinsics: None,
+            intrinsics: Err("none has arrived".into()),
             color: VecDeque::new(),
             depth: VecDeque::new(),
             rgb: Vec::new(),
             depth_m: Vec::new(),
+            silent: false,
         };
         Self {
             cameras: parameters.cameras.iter().map(state).collect(),
@@ -107,7 +125,18 @@ impl Views {
             fusion: Fusion::default(),
             heightmap: Heightmap::new(parameters.workspace.workspace()),
             last: None,
+            fuse_without_silent: parameters.fuse_without_silent,
         }
+    }
+
+    /// Whether heightmaps go on without a silent camera.
+    pub fn fuses_without_silent(&self) -> bool {
+        self.fuse_without_silent
+    }
+
+    /// Says whether nothing has come from a camera for a while.
+    pub fn set_silent(&mut self, camera: usize, silent: bool) {
+        self.cameras[camera].silent = silent;
     }
 
     /// Takes transforms; says which cannot be used.
@@ -119,13 +148,15 @@ impl Views {
     /// Takes a calibration; it holds until the next. A bad one takes the last good one away.
     pub fn calibrate(&mut self, camera: usize, message: &CameraInfo) -> Result<(), Complaint> {
         let state = &mut self.cameras[camera];
-        let intrinsics = convert::intrinsics_from_msg(message);
-        state.intrinsics = intrinsics.as_ref().ok().copied();
-        intrinsics.map(drop).map_err(|error| Complaint {
-            camera,
-            stream: Stream::Info,
-            reason: error.to_string(),
-        })
+        state.intrinsics = convert::intrinsics_from_msg(message).map_err(|error| error.to_string());
+        match &state.intrinsics {
+            Ok(_) => Ok(()),
+            Err(reason) => Err(Complaint {
+                camera,
+                stream: Stream::Info,
+                reason: reason.clone(),
+            }),
+        }
     }
 
     /// Takes an image. `true`: the clock was set back, and everything older is forgotten.
@@ -171,26 +202,36 @@ impl Views {
             return Ok(None);
         };
         let (mut cameras, mut complaints) = (Vec::new(), Vec::new());
-        let mut stamp = Duration::ZERO;
+        let without = self.fuse_without_silent;
         for (index, state) in self.cameras.iter_mut().enumerate() {
+            if without && state.silent {
+                cameras.push(None);
+                continue;
+            }
             match state.view(index, reference, &self.transforms, &self.world_frame) {
-                Ok((camera, newest)) => {
-                    cameras.push(camera);
-                    stamp = stamp.max(newest);
-                }
+                Ok(view) => cameras.push(Some(view)),
                 Err(bad) => complaints.extend(bad),
             }
         }
         if !complaints.is_empty() {
             return Err(complaints);
         }
+        let used: Vec<_> = cameras
+            .iter()
+            .map(|view| view.as_ref().map(|(_, used)| *used))
+            .collect();
+        let stamps = used.iter().flatten().map(|used| used.color.max(used.depth));
+        let stamp = stamps.max().unwrap_or(reference);
         let views: Vec<View<'_>> = cameras
             .iter()
             .zip(&self.cameras)
-            .map(|(camera, state)| View {
-                camera,
-                rgb: &state.rgb,
-                depth_m: &state.depth_m,
+            .filter_map(|(view, state)| {
+                let (camera, _) = view.as_ref()?;
+                Some(View {
+                    camera,
+                    rgb: &state.rgb,
+                    depth_m: &state.depth_m,
+                })
             })
             .collect();
         let general = |reason: String| {
@@ -220,6 +261,8 @@ impl Views {
         Ok(Some(Fused {
             message: message.map_err(|error| general(error.to_string()))?,
             heightmap: self.heightmap.clone(),
+            stamp,
+            used,
         }))
     }
 
@@ -230,12 +273,18 @@ impl Views {
                 .iter()
                 .any(|(stamp, _)| stamp.abs_diff(reference) <= self.tolerance)
         };
-        let stamps = self.cameras.iter().flat_map(|state| &state.color);
+        let waited_for = |state: &&CameraState| !(self.fuse_without_silent && state.silent);
+        let stamps = self
+            .cameras
+            .iter()
+            .filter(waited_for)
+            .flat_map(|state| &state.color);
         stamps
             .map(|(stamp, _)| *stamp)
             .filter(|reference| {
                 self.cameras
                     .iter()
+                    .filter(waited_for)
                     .all(|state| near(&state.color, *reference) && near(&state.depth, *reference))
             })
             .max()
@@ -251,7 +300,7 @@ impl CameraState {
         reference: Duration,
         transforms: &Transforms,
         world_frame: &str,
-    ) -> Result<(Camera, Duration), Vec<Complaint>> {
+    ) -> Result<(Camera, Used), Vec<Complaint>> {
         let complaint = |stream, reason: String| Complaint {
             camera: index,
             stream,
@@ -265,11 +314,14 @@ impl CameraState {
         let (Some(color), Some(depth)) = (nearest(&self.color), nearest(&self.depth)) else {
             return Err(vec![complaint(Stream::Color, "no image".into())]);
         };
-        let Some(intrinsics) = self.intrinsics else {
-            return Err(vec![complaint(
-                Stream::Info,
-                "no valid calibration has arrived, so images cannot be used".into(),
-            )]);
+        let intrinsics = match &self.intrinsics {
+            Ok(intrinsics) => *intrinsics,
+            Err(reason) => {
+                return Err(vec![complaint(
+                    Stream::Info,
+                    format!("images cannot be used without a valid calibration: {reason}"),
+                )]);
+            }
         };
         let frame = &self.color[color].1.header.frame_id;
         let pose = match self.fixed_pose {
@@ -293,7 +345,10 @@ impl CameraState {
         if let Err(error) = camera.check() {
             return Err(vec![complaint(Stream::Info, error.to_string())]);
         }
-        let newest = self.color[color].0.max(self.depth[depth].0);
+        let used = Used {
+            color: self.color[color].0,
+            depth: self.depth[depth].0,
+        };
         let mut bad = Vec::new();
         if let Err(error) =
             convert::color_from_msg(&self.color[color].1, &intrinsics, &mut self.rgb)
@@ -308,7 +363,7 @@ impl CameraState {
             self.depth.remove(depth);
         }
         if bad.is_empty() {
-            Ok((camera, newest))
+            Ok((camera, used))
         } else {
             Err(bad)
         }
@@ -318,6 +373,7 @@ impl CameraState {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use heightmap::Distortion;
     use msgs::{geometry_msgs::TransformStamped, std_msgs::Header};
     use nalgebra::{Translation3, UnitQuaternion, Vector3};
 
@@ -328,6 +384,7 @@ mod tests {
         fy_px: 30.0,
         cx_px: 31.5,
         cy_px: 23.5,
+        distortion: Distortion::NONE,
     };
 
     fn views() -> Views {
@@ -457,6 +514,73 @@ mod tests {
         }
         assert_eq!(fused_stamp_ms(&mut views), Some(1200));
         assert_eq!(fused_stamp_ms(&mut views), None);
+    }
+
+    #[test]
+    fn a_heightmap_says_which_images_it_was_made_from() {
+        let mut views = ready();
+        send(&mut views, 0, 1000);
+        send(&mut views, 0, 1033);
+        send(&mut views, 1, 1021);
+        let fused = views.fuse().unwrap().unwrap();
+        let at = |stamp_ms| {
+            let stamp = Duration::from_millis(stamp_ms);
+            Some(Used {
+                color: stamp,
+                depth: stamp,
+            })
+        };
+        assert_eq!(fused.used, [at(1033), at(1021)]);
+        assert_eq!(fused.stamp, Duration::from_millis(1033));
+    }
+
+    #[test]
+    fn a_silent_camera_is_waited_for_unless_the_others_are_enough() {
+        for without in [false, true] {
+            let parameters = CameraFusionParameters {
+                cameras: vec!["front".into(), "left".into()],
+                fuse_without_silent: without,
+                ..CameraFusionParameters::default()
+            };
+            let mut views = Views::new(&parameters, BTreeMap::new());
+            views.transform(extrinsics(&["front", "left"]));
+            calibrate(&mut views);
+            send(&mut views, 0, 1000);
+            assert_eq!(views.fuse().unwrap(), None);
+            views.set_silent(1, true);
+            let fused = views.fuse().unwrap();
+            assert_eq!(fused.is_some(), without);
+            if let Some(fused) = fused {
+                assert_eq!((fused.message.views, fused.used[1]), (1, None));
+            }
+            // It comes back: both again.
+            views.set_silent(1, false);
+            send(&mut views, 0, 1100);
+            assert_eq!(views.fuse().unwrap(), None);
+            send(&mut views, 1, 1100);
+            assert_eq!(views.fuse().unwrap().unwrap().message.views, 2);
+        }
+    }
+
+    #[test]
+    fn cameras_of_different_rates_are_fused_at_the_slowest_rate() {
+        let mut views = ready();
+        // 30 Hz and 10 Hz, not in step, and the slow one's images take 60 ms to arrive.
+        let mut arrivals: Vec<(u64, usize, u64)> = (0..90)
+            .map(|n| (1000 + n * 100 / 3, 0, 1000 + n * 100 / 3))
+            .collect();
+        arrivals.extend((0..30).map(|n| (1072 + n * 100, 1, 1012 + n * 100)));
+        arrivals.sort_unstable();
+        let mut heightmaps = 0;
+        for (_, camera, stamp_ms) in arrivals {
+            send(&mut views, camera, stamp_ms);
+            if let Some(fused) = views.fuse().unwrap() {
+                let [front, left] = [0, 1].map(|camera| fused.used[camera].unwrap().color);
+                assert!(front.abs_diff(left) <= Duration::from_millis(20));
+                heightmaps += 1;
+            }
+        }
+        assert_eq!(heightmaps, 30);
     }
 
     #[test]

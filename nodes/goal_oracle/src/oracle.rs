@@ -1,17 +1,19 @@
 //! Which goal is next: proposals, results and confirmations in, goals out, no ROS around it.
 
-use std::collections::BTreeSet;
+use std::collections::{BTreeMap, BTreeSet};
 
 use bags::Demonstration;
 use msgs::{
     builtin_interfaces::Time,
     convert::{self, ConvertError},
-    sctn_msgs::{Goal, PickPlace, StepConfirmation, StepResult},
+    sctn_msgs::{Goal, Heightmap, PickPlace, PrimitiveSettings, StepConfirmation, StepResult},
     std_msgs::Header,
 };
 
 /// Proposal ids that are remembered as seen.
 const MAX_SEEN: usize = 100_000;
+/// No sequence is taught longer than this: every goal holds a heightmap.
+const MAX_GOALS: usize = 1000;
 
 /// A demonstration without a goal.
 #[derive(Debug, thiserror::Error)]
@@ -79,6 +81,41 @@ pub enum Refusal {
     NotAsked,
 }
 
+/// A step that the sequence does not have.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[error("step is {step}, expected 1 to {count}, the number of steps")]
+pub struct NoSuchStep {
+    step: u32,
+    count: u32,
+}
+
+/// Why a heightmap cannot become a goal.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+pub enum CaptureError {
+    /// There is no goal to take the settings from.
+    #[error("settings are all zero, and there is no goal beside it to take them from")]
+    NoSettings,
+    /// A setting is not positive.
+    #[error("settings.{0}")]
+    Settings(#[from] ConvertError),
+    /// The sequence is full.
+    #[error("the sequence has {MAX_GOALS} steps, which is the most")]
+    TooMany,
+}
+
+/// A heightmap to become a goal.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Capture {
+    /// What was seen.
+    pub heightmap: Heightmap,
+    /// At the end of the sequence; else before the present goal.
+    pub append: bool,
+    /// Task module; empty for that of the goal beside it.
+    pub module: String,
+    /// Heights and speeds; all zero for those of the goal beside it.
+    pub settings: PrimitiveSettings,
+}
+
 /// What an input leads to.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Change {
@@ -125,6 +162,13 @@ pub struct Oracle {
     /// Proposals of earlier goals and for other ones.
     seen: BTreeSet<u64>,
     decider: Decider,
+    /// The highest attempt of each step that was latched with the present stamp: a step that comes again
+    /// before anything has moved needs another one, or its proposals would be taken for the old ones.
+    latched: BTreeMap<u32, u32>,
+    /// The end of the last motion, completed or stopped.
+    moved_until: Time,
+    /// Goals that were captured.
+    captured: u32,
 }
 
 /// Who says, after a motion, which goal is next.
@@ -188,7 +232,7 @@ pub fn sequence(
 }
 
 impl Oracle {
-    /// Starts at the first of `goals`, of which there is at least one.
+    /// Starts at the first of `goals`; without any it waits for [`Self::load`] or [`Self::capture`].
     pub fn new(goals: Vec<Goal>, decider: Decider) -> Self {
         Self {
             goals,
@@ -200,17 +244,123 @@ impl Oracle {
             superseded: BTreeSet::new(),
             seen: BTreeSet::new(),
             decider,
+            latched: BTreeMap::from([(1, 0)]),
+            moved_until: Time::default(),
+            captured: 0,
         }
     }
 
     /// The present goal; after the last step the last one, marked as complete.
-    pub fn goal(&self) -> Goal {
-        let complete = self.is_complete();
-        let mut goal = self.goals[self.index.min(self.goals.len() - 1)].clone();
+    pub fn goal(&self) -> Option<Goal> {
+        let mut goal = self.goals.get(self.index).or(self.goals.last())?.clone();
         goal.header.stamp = self.stamp;
         goal.attempt = self.attempt;
-        goal.complete = complete;
-        goal
+        goal.complete = self.is_complete();
+        Some(goal)
+    }
+
+    /// The images to be reached, one after the other.
+    pub fn images(&self) -> impl Iterator<Item = &Heightmap> {
+        self.goals.iter().map(|goal| &goal.heightmap)
+    }
+
+    /// The end of the last motion: older heightmaps show what is no more.
+    pub fn moved_until(&self) -> Time {
+        self.moved_until
+    }
+
+    /// Latches the goal of another step; the present one changes nothing unless the run has ended.
+    pub fn set_step(&mut self, step: u32) -> Result<Change, NoSuchStep> {
+        let count = self.goals.len() as u32;
+        if !(1..=count).contains(&step) {
+            return Err(NoSuchStep { step, count });
+        }
+        let index = step as usize - 1;
+        if index == self.index && !self.stopped {
+            return Ok(Change::None);
+        }
+        Ok(self.relatch(index))
+    }
+
+    /// Starts at the first goal of another sequence, of which there is at least one.
+    pub fn load(&mut self, goals: Vec<Goal>) -> Change {
+        self.goals = goals;
+        self.captured = 0;
+        self.relatch(0)
+    }
+
+    /// Takes what is seen into the sequence: the step that it ends, and the change.
+    pub fn capture(&mut self, capture: Capture) -> Result<(u32, Change), CaptureError> {
+        if self.goals.len() >= MAX_GOALS {
+            return Err(CaptureError::TooMany);
+        }
+        let Capture {
+            heightmap,
+            append,
+            module,
+            settings,
+        } = capture;
+        let beside = self.goals.get(self.index).or(self.goals.last());
+        let given = settings != PrimitiveSettings::default();
+        if given {
+            convert::settings_from_msg(&settings)?;
+        }
+        let (problem, demonstration) = match beside {
+            Some(goal) => {
+                let name = goal.demonstration.as_str();
+                let name = name.rsplit_once('+').map_or(name, |(name, _)| name);
+                (goal.problem.clone(), name.to_owned())
+            }
+            None => ("captured".to_owned(), "captured".to_owned()),
+        };
+        let goal = Goal {
+            header: Header {
+                frame_id: heightmap.header.frame_id.clone(),
+                ..Header::default()
+            },
+            problem,
+            settings: match (given, beside) {
+                (true, _) => settings,
+                (false, Some(goal)) => goal.settings.clone(),
+                (false, None) => return Err(CaptureError::NoSettings),
+            },
+            module: match beside {
+                Some(goal) if module.is_empty() => goal.module.clone(),
+                _ => module,
+            },
+            heightmap,
+            ..Goal::default()
+        };
+        let end = self.goals.len();
+        let index = if append { end } else { self.index };
+        self.goals.insert(index, goal);
+        self.captured += 1;
+        // Another name: goals of the same step number are not the same any more.
+        let demonstration = format!("{demonstration}+{}", self.captured);
+        let step_count = self.goals.len() as u32;
+        for (index, goal) in self.goals.iter_mut().enumerate() {
+            goal.step = index as u32 + 1;
+            goal.step_count = step_count;
+            goal.demonstration.clone_from(&demonstration);
+        }
+        // Whoever works on the present goal is not disturbed by what comes after it.
+        let change = if index == self.index {
+            self.relatch(index)
+        } else {
+            Change::None
+        };
+        Ok((index as u32 + 1, change))
+    }
+
+    /// Latches a goal because somebody said so, not because of a motion.
+    fn relatch(&mut self, index: usize) -> Change {
+        self.stopped = false;
+        let order = |time: Time| (time.sec, time.nanosec);
+        let stamp = std::cmp::max_by_key(self.stamp, self.moved_until, |time| order(*time));
+        let step = index as u32 + 1;
+        let before = self.latched.get(&step).filter(|_| stamp == self.stamp);
+        let attempt = before.map_or(0, |attempt| attempt + 1);
+        self.latch(index, attempt, stamp)
     }
 
     /// Whether all steps are done.
@@ -231,11 +381,11 @@ impl Oracle {
 
     /// A proposal was published. The newest for the present goal is current, until the arm moves.
     pub fn proposed(&mut self, proposal: &PickPlace) {
-        let goal = &self.goals[self.index.min(self.goals.len() - 1)];
-        let of_this_goal = (proposal.step, proposal.attempt) == (goal.step, self.attempt)
-            && proposal.problem == goal.problem
-            && !self.is_complete()
-            && !self.stopped;
+        let of_this_goal = !self.stopped
+            && self.goals.get(self.index).is_some_and(|goal| {
+                (proposal.step, proposal.attempt) == (goal.step, self.attempt)
+                    && proposal.problem == goal.problem
+            });
         if !of_this_goal {
             self.remember(proposal.id);
             return;
@@ -264,6 +414,10 @@ impl Oracle {
 
     /// The executor has reported.
     pub fn result(&mut self, result: &StepResult) -> Change {
+        // Its stop may have been heard before.
+        if result.outcome == StepResult::STOPPED && self.is_current(result.proposal_id) {
+            self.moved_until = result.header.stamp;
+        }
         if self.stopped || self.is_complete() {
             return Change::None;
         }
@@ -312,6 +466,7 @@ impl Oracle {
             return Change::None;
         }
         current.moved = Some(result.header.stamp);
+        self.moved_until = result.header.stamp;
         let verdict = match (self.decider, result.outcome) {
             (Decider::Operator, _) => current.waiting,
             (Decider::Outcome, StepResult::PLACED) => Some(Verdict::Advance),
@@ -403,10 +558,17 @@ impl Oracle {
         for id in std::mem::take(&mut self.superseded) {
             self.remember(id);
         }
+        if stamp != self.stamp {
+            self.latched.clear();
+        }
+        self.latched.insert(index as u32 + 1, attempt);
         self.index = index;
         self.attempt = attempt;
         self.stamp = stamp;
-        Change::Goal(Box::new(self.goal()))
+        match self.goal() {
+            Some(goal) => Change::Goal(Box::new(goal)),
+            None => Change::None,
+        }
     }
 
     fn remember(&mut self, id: u64) {
@@ -696,6 +858,135 @@ mod tests {
         assert_eq!(
             oracle.confirmed(&says(StepConfirmation::ADVANCE, 8)),
             Err(Refusal::NotAsked)
+        );
+    }
+
+    #[test]
+    fn another_step_is_latched_at_a_call_and_no_attempt_is_used_twice_before_something_moves() {
+        let mut oracle = oracle(3);
+        assert_eq!(oracle.set_step(1), Ok(Change::None));
+        assert_eq!(goal(oracle.set_step(3).unwrap()), (3, 0, 0, false));
+        assert_eq!(oracle.set_step(3), Ok(Change::None));
+        // Its proposals of before would have the same ids.
+        assert_eq!(goal(oracle.set_step(1).unwrap()), (1, 1, 0, false));
+        for step in [0, 4] {
+            let refusal = oracle.set_step(step).unwrap_err().to_string();
+            assert!(refusal.contains("expected 1 to 3"), "{refusal}");
+        }
+        oracle.proposed(&proposal(7, 1, 1));
+        oracle.result(&result(7, StepResult::PLACED, 5));
+        // Before the operator has confirmed: what was seen before the motion is no ground to go on.
+        assert_eq!(goal(oracle.set_step(3).unwrap()), (3, 0, 5, false));
+        assert_eq!(
+            oracle.confirmed(&says(StepConfirmation::ADVANCE, 7)),
+            Err(Refusal::Stale {
+                id: 7,
+                step: 3,
+                attempt: 0
+            })
+        );
+    }
+
+    #[test]
+    fn a_step_that_is_set_ends_a_stop_and_a_completed_run() {
+        let mut oracle = oracle(1);
+        oracle.proposed(&proposal(7, 1, 0));
+        oracle.confirmed(&says(StepConfirmation::STOP, 7)).unwrap();
+        // The motion's end is heard after the stop.
+        oracle.result(&result(7, StepResult::STOPPED, 4));
+        assert_eq!(goal(oracle.set_step(1).unwrap()), (1, 0, 4, false));
+        oracle.proposed(&proposal(8, 1, 0));
+        oracle.result(&result(8, StepResult::PLACED, 6));
+        let end = oracle.confirmed(&says(StepConfirmation::ADVANCE, 8));
+        assert_eq!(goal(end.unwrap()), (1, 0, 6, true));
+        assert_eq!(goal(oracle.set_step(1).unwrap()), (1, 1, 6, false));
+    }
+
+    #[test]
+    fn another_sequence_starts_at_its_first_goal() {
+        let mut oracle = oracle(3);
+        oracle.set_step(2).unwrap();
+        let other = Goal {
+            problem: "chaining".into(),
+            step: 1,
+            step_count: 1,
+            ..Goal::default()
+        };
+        let loaded = oracle.load(vec![other]);
+        assert_eq!(goal(loaded), (1, 1, 0, false));
+        assert_eq!(oracle.goal().unwrap().problem, "chaining");
+        assert_eq!(oracle.progress(), (1, 1, 1));
+    }
+
+    fn seen(height_m: f32) -> Heightmap {
+        Heightmap {
+            height_m: vec![height_m],
+            ..Heightmap::default()
+        }
+    }
+
+    fn capture(height_m: f32, append: bool) -> Capture {
+        Capture {
+            heightmap: seen(height_m),
+            append,
+            module: String::new(),
+            settings: PrimitiveSettings::default(),
+        }
+    }
+
+    fn heights(oracle: &Oracle) -> Vec<f32> {
+        oracle
+            .images()
+            .map(|image| image.height_m.first().copied().unwrap_or(-1.0))
+            .collect()
+    }
+
+    #[test]
+    fn what_is_captured_is_the_present_goal_or_the_last() {
+        let mut oracle = oracle(2);
+        oracle.set_step(2).unwrap();
+        let (step, change) = oracle.capture(capture(0.1, false)).unwrap();
+        assert_eq!((step, goal(change)), (2, (2, 1, 0, false)));
+        assert_eq!(heights(&oracle), [-1.0, 0.1, -1.0]);
+        // Whoever works on the present goal is not disturbed.
+        assert_eq!(
+            oracle.capture(capture(0.2, true)).unwrap(),
+            (4, Change::None)
+        );
+        assert_eq!(heights(&oracle), [-1.0, 0.1, -1.0, 0.2]);
+        let last = goal(oracle.set_step(4).unwrap());
+        assert_eq!(last, (4, 0, 0, false));
+        let last = oracle.goal().unwrap();
+        assert_eq!((last.step_count, last.demonstration.as_str()), (4, "+2"));
+    }
+
+    #[test]
+    fn a_sequence_can_be_taught_from_nothing() {
+        let mut oracle = oracle(0);
+        assert_eq!(oracle.goal(), None);
+        oracle.proposed(&proposal(7, 1, 0));
+        assert_eq!(
+            oracle.capture(capture(0.1, true)),
+            Err(CaptureError::NoSettings)
+        );
+        let mut first = capture(0.1, true);
+        first.settings = convert::settings_to_msg(&pick_place::PrimitiveSettings::RIGID);
+        let mut wrong = first.clone();
+        wrong.settings.lift_m = f64::NAN;
+        let refusal = oracle.capture(wrong).unwrap_err().to_string();
+        assert!(refusal.contains("settings.lift_m"), "{refusal}");
+        let (step, change) = oracle.capture(first).unwrap();
+        assert_eq!((step, goal(change)), (1, (1, 1, 0, false)));
+        let (step, change) = oracle.capture(capture(0.2, true)).unwrap();
+        assert_eq!((step, change), (2, Change::None));
+        let goal = oracle.goal().unwrap();
+        assert_eq!((goal.problem.as_str(), goal.step_count), ("captured", 2));
+        while oracle.goals.len() < MAX_GOALS {
+            oracle.capture(capture(0.3, true)).unwrap();
+        }
+        assert_eq!(
+            oracle.capture(capture(0.3, true)),
+            Err(CaptureError::TooMany)
         );
     }
 

@@ -24,6 +24,7 @@ pub enum GoalModule {
 #[allow(missing_docs)]
 pub struct GoalOracleParameters {
     pub demonstration: PathBuf,
+    pub start_empty: bool,
     pub goal_module: GoalModule,
     pub embedding: PathBuf,
     pub require_confirmation: bool,
@@ -34,6 +35,7 @@ impl Default for GoalOracleParameters {
     fn default() -> Self {
         Self {
             demonstration: PathBuf::new(),
+            start_empty: false,
             goal_module: GoalModule::Oracle,
             embedding: PathBuf::new(),
             require_confirmation: true,
@@ -43,15 +45,16 @@ impl Default for GoalOracleParameters {
 }
 
 impl GoalOracleParameters {
-    /// The demonstration's path; there is no default one.
-    pub(crate) fn demonstration(&self) -> Result<&Path, InvalidParameter> {
-        if self.demonstration == Path::new("") {
-            return Err(InvalidParameter::new(
+    /// The demonstration's path; there is no default one, and none only where that was asked for.
+    pub(crate) fn demonstration(&self) -> Result<Option<&Path>, InvalidParameter> {
+        match (self.demonstration == Path::new(""), self.start_empty) {
+            (true, true) => Ok(None),
+            (true, false) => Err(InvalidParameter::new(
                 "demonstration",
-                "expected the path of a demonstration bag, found nothing",
-            ));
+                "expected the path of a demonstration bag, found nothing (or set start_empty)",
+            )),
+            (false, _) => Ok(Some(&self.demonstration)),
         }
-        Ok(&self.demonstration)
     }
 }
 

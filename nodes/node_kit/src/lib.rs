@@ -12,6 +12,7 @@ mod graph;
 mod lifecycle;
 pub mod logging;
 mod node;
+mod once;
 mod parameter_services;
 mod parameter_store;
 mod parameters;
@@ -29,6 +30,7 @@ pub use diagnostics::{Diagnostics, Level};
 pub use graph::Graph;
 pub use lifecycle::{Active, LifecycleClient, LifecycleError, State, Transition};
 pub use node::{Node, NodeError};
+pub use once::{InvalidRequestId, Once};
 pub use parameters::{
     InvalidParameter, Loaded, NoParameters, ParameterError, Parameters, Range, load_text,
     mistakes_in_documentation,

@@ -2,6 +2,7 @@
 
 mod bag;
 mod bench;
+mod camera_stream;
 mod curves;
 mod demos;
 mod embed;
@@ -10,6 +11,7 @@ mod gallery;
 mod goals;
 mod health;
 mod idle;
+mod interfaces;
 mod latency;
 mod launch;
 mod picture;
@@ -46,6 +48,8 @@ enum Command {
     Demos(demos::Demos),
     /// Check the physics of a problem, and that no policy solves it by accident
     Health(health::Health),
+    /// Print every topic, service, action and parameter of the nodes: docs/interfaces.md
+    Interfaces(interfaces::Interfaces),
     /// Train a policy on demonstrations, by a recipe
     Train(train::Train),
     /// Train and test many policies: problems, agents, demonstrations and seeds
@@ -76,6 +80,7 @@ fn main() -> Result<ExitCode> {
         Command::Bench(bench) => bench.run(&root()?),
         Command::Demos(demos) => demos.run(&root()?),
         Command::Health(health) => health.run(&root()?),
+        Command::Interfaces(interfaces) => interfaces.run(&root()?),
         Command::Train(train) => train.run(&root()?),
         Command::Sweep(sweep) => sweep.run(&root()?),
         Command::Search(search) => search.run(&root()?),

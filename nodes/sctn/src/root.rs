@@ -25,14 +25,15 @@ impl Root {
         }
         let current = std::env::current_dir().context("current folder")?;
         let program = std::env::current_exe().context("path of the program")?;
-        let found = current
-            .ancestors()
-            .chain(program.ancestors())
+        let above = current.ancestors().chain(program.ancestors());
+        let found = above
+            // Installed as a ROS package, the files are in share/.
+            .flat_map(|path| [path.to_owned(), path.join("share/sctn")])
             .find(|path| is_root(path));
         let found = found.context(
             "no config/problems and urdf above the current folder: name their folder with --root",
         )?;
-        Ok(Self(found.to_owned()))
+        Ok(Self(found))
     }
 
     /// A path below.

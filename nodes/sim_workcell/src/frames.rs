@@ -1,4 +1,4 @@
-//! What the three cameras see, as messages.
+//! What the three cameras see, and where everything is, as messages.
 
 use std::time::Duration;
 
@@ -9,6 +9,7 @@ use msgs::sensor_msgs::{CameraInfo, Image};
 use msgs::tf2_msgs::TFMessage;
 use multiravens::render::RgbdImage;
 use node_kit::{Node, NodeError, Publisher, Qos};
+use ur5::{Joints, WorkCell};
 
 /// One capture of one camera.
 #[derive(Clone)]
@@ -55,9 +56,12 @@ impl CameraTopics {
     }
 }
 
+/// What follows the camera's name in that of its optical frame.
+const OPTICAL_FRAME: &str = "_camera_optical_frame";
+
 /// Name of a camera's optical frame, as in the URDF.
 fn optical_frame(camera: &str) -> String {
-    format!("{camera}_camera_optical_frame")
+    format!("{camera}{OPTICAL_FRAME}")
 }
 
 /// Where the cameras are.
@@ -71,6 +75,37 @@ pub fn camera_transforms(
             header: convert::header(stamp, world_frame)?,
             child_frame_id: optical_frame(&camera.name),
             transform: convert::isometry_to_msg(&camera.world_from_camera),
+        })
+    });
+    Ok(TFMessage {
+        transforms: transforms.collect::<Result<_, _>>()?,
+    })
+}
+
+/// Where the links of the cell are: those that stand still, without the cameras, or those that the arm's
+/// joints move.
+pub fn link_transforms(
+    cell: &WorkCell,
+    joints: &Joints,
+    moving: bool,
+    world_frame: &str,
+    stamp: Duration,
+) -> Result<TFMessage, ConvertError> {
+    let root = cell.root();
+    let wanted = cell
+        .frames
+        .iter()
+        .filter(|frame| frame.joint.is_some() == moving && !frame.child.ends_with(OPTICAL_FRAME));
+    let transforms = wanted.map(|frame| {
+        let parent = if frame.parent == root {
+            world_frame
+        } else {
+            &frame.parent
+        };
+        Ok::<_, ConvertError>(TransformStamped {
+            header: convert::header(stamp, parent)?,
+            child_frame_id: frame.child.clone(),
+            transform: convert::isometry_to_msg(&frame.pose(joints)),
         })
     });
     Ok(TFMessage {
@@ -114,5 +149,24 @@ mod tests {
         assert_eq!(tf.transforms[0].child_frame_id, frame.color.header.frame_id);
         let pose = convert::isometry_from_msg(&tf.transforms[0].transform).unwrap();
         assert_eq!(pose, camera.world_from_camera);
+    }
+
+    #[test]
+    fn the_links_hang_on_the_world_frame_and_the_cameras_are_left_to_their_own_transforms() {
+        let cell = WorkCell::builtin().unwrap();
+        let now = Duration::from_secs(2);
+        let said = |moving| link_transforms(&cell, &cell.arm.ready, moving, "cell", now).unwrap();
+        let (fixed, moving) = (said(false).transforms, said(true).transforms);
+        assert_eq!(moving.len(), 6);
+        let base = fixed.iter().find(|one| one.child_frame_id == "base_link");
+        assert_eq!(base.unwrap().header.frame_id, "cell");
+        assert!(
+            fixed.iter().all(
+                |one| !one.child_frame_id.contains("optical") && one.header.frame_id != "world"
+            )
+        );
+        assert!(moving.iter().all(|one| one.header.stamp.sec == 2));
+        // Together with the cameras they are all frames of the cell.
+        assert_eq!(fixed.len() + moving.len() + 3, cell.frames.len());
     }
 }

@@ -13,9 +13,9 @@ use msgs::control_msgs::{
 };
 use msgs::convert;
 use msgs::rosgraph_msgs::Clock;
-use msgs::sctn_msgs::Reward;
+use msgs::sctn_msgs::{ResetCell, ResetCellRequest, ResetCellResponse, Reward};
 use msgs::sensor_msgs::JointState;
-use msgs::std_msgs::{Bool, Header};
+use msgs::std_msgs::{self, Bool, Header};
 use msgs::tf2_msgs::TFMessage;
 use msgs::trajectory_msgs::JointTrajectoryPoint;
 use msgs::ur_dashboard_msgs::{RobotMode, SafetyMode};
@@ -24,13 +24,13 @@ use msgs::ur_msgs::{
     FollowJointTrajectoryUntilResult, IOStates, SetIO, SetIORequest, SetIOResponse,
 };
 use multiravens::{MotionEnd, Problem};
-use node_kit::{Active, Level, NewGoal, Node, Publisher, Qos, RunningGoal};
+use node_kit::{Active, Level, NewGoal, Node, Once, Publisher, Qos, RunningGoal};
 use tokio::sync::oneshot;
 use tracing::{error, info, warn};
 use ur5::{JointTrajectory, WorkCell};
 
 use crate::driver::{Failure, follow_trajectory, until_trajectory};
-use crate::frames::{CameraTopics, Frame, camera_transforms};
+use crate::frames::{CameraTopics, Frame, camera_transforms, link_transforms};
 use crate::parameters::SimWorkcellParameters;
 use crate::workcell::{Step, Wiring, Workcell};
 
@@ -100,6 +100,7 @@ impl Active for HardwareNode {
         let mut follow = node.action_server::<FollowJointTrajectory>(&self.follow_action)?;
         let mut until = node.action_server::<FollowJointTrajectoryUntil>(&self.until_action)?;
         let mut set_io = node.service_server::<SetIO>("io_and_status_controller/set_io")?;
+        let mut reset = node.service_server::<ResetCell>("~/reset")?;
         let hardware = self.hardware.take();
         let mut hardware = hardware.context("the hardware's thread has not ended")?;
         self.stop.store(false, Ordering::Release);
@@ -118,6 +119,15 @@ impl Active for HardwareNode {
                     // Dropped where the command was not taken.
                     let success = replied.await.unwrap_or(false);
                     set_io.respond(id, SetIOResponse { success });
+                }
+                (id, request) = reset.recv() => {
+                    let (reply, replied) = oneshot::channel();
+                    pass_on(sender, Command::Reset(request, reply));
+                    let refused = || ResetCellResponse {
+                        message: "too many other commands wait".into(),
+                        ..Default::default()
+                    };
+                    reset.respond(id, replied.await.unwrap_or_else(|_| refused()));
                 }
                 ended = &mut thread => {
                     return ended.context("the hardware's thread panicked")?.1;
@@ -144,6 +154,7 @@ enum Command {
     Follow(NewGoal<FollowJointTrajectory>),
     Until(NewGoal<FollowJointTrajectoryUntil>),
     SetIo(SetIORequest, oneshot::Sender<bool>),
+    Reset(ResetCellRequest, oneshot::Sender<ResetCellResponse>),
 }
 
 /// A goal that is being carried out.
@@ -259,16 +270,20 @@ struct Hardware {
     stop: Arc<AtomicBool>,
     clock: Publisher<Clock>,
     joint_states: Publisher<JointState>,
+    /// Of the arm's links.
+    tf: Option<Publisher<TFMessage>>,
     io_states: Publisher<IOStates>,
     reward: Publisher<Reward>,
     cameras: Vec<CameraTopics>,
     /// Latched, said once; kept so that late joiners hear them.
     _tf_static: Publisher<TFMessage>,
+    _robot_description: Option<Publisher<std_msgs::String>>,
     _robot_mode: Publisher<RobotMode>,
     _safety_mode: Publisher<SafetyMode>,
     _program_running: Publisher<Bool>,
     /// What the cameras saw at this rest.
     frames: Vec<Frame>,
+    resets: Once<ResetCellResponse>,
     said_pins: IOStates,
     next_status: Instant,
     next_pins: Instant,
@@ -290,11 +305,26 @@ impl Hardware {
             .map(|camera| CameraTopics::new(node, &camera.name));
         let topics = topics.collect::<Result<_, _>>()?;
         let tf_static = node.publisher("/tf_static", Qos::Latched)?;
-        tf_static.publish(camera_transforms(
-            cameras,
-            &parameters.world_frame,
-            workcell.time(),
-        )?);
+        let mut fixed = camera_transforms(cameras, &parameters.world_frame, workcell.time())?;
+        let robot_description = match parameters.publish_robot {
+            false => None,
+            true => {
+                let links = link_transforms(
+                    &work_cell,
+                    &work_cell.arm.home,
+                    false,
+                    &parameters.world_frame,
+                    workcell.time(),
+                )?;
+                fixed.transforms.extend(links.transforms);
+                let description = node.publisher("robot_description", Qos::Latched)?;
+                description.publish(std_msgs::String {
+                    data: work_cell.urdf.clone(),
+                });
+                Some(description)
+            }
+        };
+        tf_static.publish(fixed);
         let status = |name| format!("io_and_status_controller/{name}");
         let robot_mode = node.publisher(&status("robot_mode"), Qos::Latched)?;
         robot_mode.publish(RobotMode {
@@ -310,6 +340,11 @@ impl Hardware {
             // Best effort: the readers of /clock that ros2-client makes acknowledge nothing.
             clock: node.publisher("/clock", Qos::Image)?,
             joint_states: node.publisher("joint_states", Qos::Event)?,
+            tf: match &robot_description {
+                Some(_) => Some(node.publisher("/tf", Qos::Event)?),
+                None => None,
+            },
+            _robot_description: robot_description,
             io_states: node.publisher(&status("io_states"), Qos::Event)?,
             reward: node.publisher("reward", Qos::Event)?,
             node: node.clone(),
@@ -325,6 +360,7 @@ impl Hardware {
             _safety_mode: safety_mode,
             _program_running: program_running,
             frames: Vec::new(),
+            resets: Once::default(),
             next_status: Instant::now(),
             next_pins: Instant::now(),
             next_frames: Instant::now(),
@@ -382,6 +418,12 @@ impl Hardware {
                 self.set_io(&request, reply);
                 Ok(())
             }
+            Command::Reset(request, reply) => {
+                let answer = self.reset(&request)?;
+                // The caller may have gone.
+                let _ = reply.send(answer);
+                Ok(())
+            }
         }
     }
 
@@ -392,7 +434,61 @@ impl Hardware {
             Command::Follow(goal) => goal.reject(reason),
             Command::Until(goal) => goal.reject(reason),
             Command::SetIo(request, reply) => self.set_io(&request, reply),
+            Command::Reset(request, reply) => {
+                let known = self.resets.answered(&request.request_id);
+                let answer = known.ok().flatten().unwrap_or_else(|| ResetCellResponse {
+                    message: format!("{reason}: cancel it first"),
+                    ..Default::default()
+                });
+                let _ = reply.send(answer);
+            }
         }
+    }
+
+    /// Begins an episode; only failures to speak of it are errors.
+    fn reset(&mut self, request: &ResetCellRequest) -> anyhow::Result<ResetCellResponse> {
+        let refusal = |message: String| {
+            warn!("reset: {message}");
+            ResetCellResponse {
+                message,
+                ..Default::default()
+            }
+        };
+        match self.resets.answered(&request.request_id) {
+            Err(invalid) => return Ok(refusal(invalid.to_string())),
+            Ok(Some(answer)) => return Ok(answer),
+            Ok(None) => {}
+        }
+        let name = match request.problem.as_str() {
+            "" => &self.parameters.problem,
+            name => name,
+        }
+        .to_owned();
+        let seed = request.seed;
+        let begun = Problem::load(&self.parameters.problems_dir, &name)
+            .map_err(|error| error.to_string())
+            .and_then(|problem| {
+                let begun = self.workcell.reset(&problem, &self.work_cell, seed);
+                begun.map_err(|error| error.to_string())
+            });
+        let answer = match begun {
+            Ok(()) => {
+                info!("reset: problem {name}, seed {seed}");
+                self.parameters.problem = name;
+                self.parameters.seed = seed;
+                self.say_pins();
+                self.say_status()?;
+                self.look()?;
+                ResetCellResponse {
+                    success: true,
+                    stamp: self.header()?.stamp,
+                    ..Default::default()
+                }
+            }
+            Err(reason) => refusal(reason),
+        };
+        self.resets.remember(&request.request_id, answer.clone());
+        Ok(answer)
     }
 
     fn set_io(&mut self, request: &SetIORequest, reply: oneshot::Sender<bool>) {
@@ -556,6 +652,15 @@ impl Hardware {
             &self.workcell.joints_rad(),
             &self.workcell.velocities_rad_s(),
         ));
+        if let Some(tf) = &self.tf {
+            tf.publish(link_transforms(
+                &self.work_cell,
+                &self.workcell.joints_rad(),
+                true,
+                &self.parameters.world_frame,
+                self.workcell.time(),
+            )?);
+        }
         self.next_status = self.after(self.parameters.status_period_s);
         Ok(())
     }

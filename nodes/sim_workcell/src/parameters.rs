@@ -19,6 +19,8 @@ pub struct SimWorkcellParameters {
     pub urdf: PathBuf,
     /// Frame of the work cell.
     pub world_frame: String,
+    /// Whether to say where the links are and what they look like.
+    pub publish_robot: bool,
     /// Action that follows a trajectory.
     pub follow_action: String,
     /// Action that follows a trajectory until the tool touches something.
@@ -45,6 +47,7 @@ impl Default for SimWorkcellParameters {
             problems_dir: "config/problems".into(),
             urdf: PathBuf::new(),
             world_frame: "world".into(),
+            publish_robot: true,
             follow_action: "scaled_joint_trajectory_controller/follow_joint_trajectory".into(),
             until_action: "trajectory_until_node/execute".into(),
             suction_pin: 16,

@@ -20,9 +20,14 @@ pub(crate) struct Wiring {
     pub vacuum_pin: u8,
 }
 
+/// Time between the end of an episode and the beginning of the next.
+const PAUSE: Duration = Duration::from_secs(1);
+
 /// An episode of a problem, driven by goals and pins.
 pub(crate) struct Workcell {
     environment: Environment,
+    /// Simulated time of the episodes before: time never runs back.
+    past: Duration,
     wiring: Wiring,
     /// Digital outputs that are not suction.
     outputs: BTreeMap<u8, bool>,
@@ -54,6 +59,7 @@ impl Workcell {
         environment.reset(seed)?;
         Ok(Self {
             environment,
+            past: Duration::ZERO,
             wiring,
             outputs: (0..PINS).map(|pin| (pin, false)).collect(),
             flags: BTreeMap::new(),
@@ -61,6 +67,19 @@ impl Workcell {
             rests: true,
             assessed: true,
         })
+    }
+
+    /// Begins another episode. The state stays as it is where that cannot begin.
+    pub(crate) fn reset(
+        &mut self,
+        problem: &Problem,
+        work_cell: &WorkCell,
+        seed: u64,
+    ) -> Result<(), EnvironmentError> {
+        let next = Self::new(problem, work_cell, seed, self.wiring)?;
+        let past = self.time() + PAUSE;
+        *self = Self { past, ..next };
+        Ok(())
     }
 
     pub(crate) fn environment(&self) -> &Environment {
@@ -71,9 +90,9 @@ impl Workcell {
         &mut self.environment
     }
 
-    /// Simulated time since the reset.
+    /// Simulated time since the node's start.
     pub(crate) fn time(&self) -> Duration {
-        self.environment.cell().time()
+        self.past + self.environment.cell().time()
     }
 
     pub(crate) fn joints_rad(&self) -> Joints {
@@ -326,6 +345,25 @@ mod tests {
         // From here the same trajectory would jump.
         let failure = workcell.begin(trajectory, false).unwrap_err();
         assert!(failure.reason.contains("starts at"), "{failure}");
+    }
+
+    #[test]
+    fn a_reset_begins_the_episode_of_a_seed_as_a_start_does_and_time_goes_on() {
+        let (mut workcell, work_cell) = workcell();
+        let start = (workcell.time(), workcell.environment().state_hash());
+        let trajectory =
+            follow_trajectory(&turn(&work_cell), &work_cell.arm, &work_cell.joint_names).unwrap();
+        workcell.begin(trajectory, false).unwrap();
+        while workcell.step() == Step::Moving {}
+        workcell.set_io(&set(16, 1.0)).unwrap();
+        let before = workcell.time();
+        workcell.reset(&problem(), &work_cell, 10_002).unwrap();
+        assert_ne!(workcell.environment().state_hash(), start.1);
+        workcell.reset(&problem(), &work_cell, 10_000).unwrap();
+        assert_eq!(workcell.environment().state_hash(), start.1);
+        assert!(workcell.time() > before + PAUSE && workcell.is_at_rest());
+        assert_eq!(workcell.joints_rad(), work_cell.arm.home);
+        assert!(!output(&workcell, 16) && workcell.assess().is_none());
     }
 
     #[test]

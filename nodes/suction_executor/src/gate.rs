@@ -298,6 +298,24 @@ impl Gate {
         }
     }
 
+    /// Says why a proposal cannot be approved any more; whether it can be now, only [`Self::confirm`] knows.
+    pub fn open(&self, id: u64) -> Result<(), String> {
+        match (self.fate(id), &self.newest) {
+            (None, _) => Err(format!("proposal {id} is unknown")),
+            (Some(Fate::Open), Some(newest)) if newest.id == id => {
+                newest.checked.as_ref().map(drop).map_err(String::clone)
+            }
+            (Some(fate), _) => Err(fate.reason(id)),
+        }
+    }
+
+    /// Takes a proposal back that nobody has approved yet.
+    pub fn withdraw(&mut self, id: u64) {
+        if self.fate(id) == Some(Fate::Open) {
+            self.set_fate(id, Fate::Withdrawn);
+        }
+    }
+
     /// Asks whether the arm may go home, as an operator has called for; [`Self::finish`] has to
     /// follow where it may.
     ///
@@ -924,6 +942,26 @@ mod tests {
         assert_eq!(decide(&mut gate, 7, Decision::Stop), Verdict::Nothing);
         let verdict = decide(&mut gate, 99, Decision::Stop);
         assert_refused(&gate, verdict, &["99", "unknown"]);
+    }
+
+    #[test]
+    fn a_withdrawn_proposal_cannot_be_approved_and_says_so() {
+        let mut gate = gate();
+        assert_eq!(gate.open(7), Ok(()));
+        assert!(gate.open(99).unwrap_err().contains("unknown"));
+        gate.withdraw(7);
+        assert!(gate.open(7).unwrap_err().contains("withdrawn"));
+        let verdict = approve(&mut gate, 7);
+        assert_refused(&gate, verdict, &["7", "withdrawn"]);
+        let mut bad = proposal(8);
+        bad.frame = "camera".into();
+        gate.propose(8, Ok(bad));
+        assert!(gate.open(8).unwrap_err().contains("camera"));
+        // One that moves is not taken back.
+        gate.propose(9, Ok(proposal(9)));
+        assert!(matches!(approve(&mut gate, 9), Verdict::Move(_)));
+        gate.withdraw(9);
+        assert!(gate.open(9).unwrap_err().contains("being carried out"));
     }
 
     #[test]

@@ -8,16 +8,19 @@ use std::time::{Duration, Instant};
 use anyhow::Context as _;
 use heightmap::Workspace;
 use msgs::convert::{self, ConvertError};
-use msgs::sctn_msgs;
+use msgs::sctn_msgs::{self, ExecutePickPlace, ExecutePickPlaceFeedback, ExecutePickPlaceResult};
 use msgs::sensor_msgs::JointState;
 use msgs::std_msgs::Bool;
 use msgs::std_srvs::{Trigger, TriggerResponse};
 use msgs::ur_dashboard_msgs::{RobotMode, SafetyMode};
 use msgs::ur_msgs::{Digital, IOStates};
-use node_kit::{Active, Level, Node, Publisher, Qos, RequestId, ServiceServer, Subscription};
+use node_kit::{
+    ActionServer, Active, Level, NewGoal, Node, Publisher, Qos, RequestId, RunningGoal,
+    ServiceServer, Subscription,
+};
 use pick_place::{ExecuteError, Outcome, Phase, PickPlace};
 use tokio::runtime::Handle;
-use tokio::sync::watch;
+use tokio::sync::{mpsc, watch};
 use tokio::task::JoinHandle;
 use tokio_util::sync::CancellationToken;
 use tracing::{error, info, warn};
@@ -97,6 +100,7 @@ pub struct ExecutorNode {
 impl Active for ExecutorNode {
     async fn run(&mut self, node: &Node) -> anyhow::Result<()> {
         let parameters = node.parameters::<SuctionExecutorParameters>();
+        let (phase_sender, phases) = mpsc::unbounded_channel();
         let executor = Executor {
             proposals: node.subscription("pick_place", Qos::Latched)?,
             confirmations: node.subscription("step_confirmation", Qos::Event)?,
@@ -104,6 +108,10 @@ impl Active for ExecutorNode {
             results: &self.results,
             home: node.service_server("~/home")?,
             home_calls: Vec::new(),
+            goals: node.action_server("execute_pick_place")?,
+            goal: None,
+            phase_sender,
+            phases,
             gate: &mut self.gate,
             automatic: &mut self.automatic,
             waiting: VecDeque::new(),
@@ -205,6 +213,15 @@ struct Motion {
     task: JoinHandle<Ended>,
 }
 
+/// A goal of the action, from its acceptance to its end.
+struct Goal {
+    /// Its proposal.
+    id: u64,
+    running: RunningGoal<ExecutePickPlace>,
+    moving: bool,
+    cancelling: bool,
+}
+
 /// How a motion ended.
 struct Ended {
     /// Nothing at home without a primitive.
@@ -224,6 +241,11 @@ struct Executor<'a> {
     home: ServiceServer<Trigger>,
     /// Calls of `home` to be answered when the arm is there.
     home_calls: Vec<RequestId>,
+    goals: ActionServer<ExecutePickPlace>,
+    goal: Option<Goal>,
+    phase_sender: mpsc::UnboundedSender<Phase>,
+    /// Phases of the motion under way.
+    phases: mpsc::UnboundedReceiver<Phase>,
     gate: &'a mut Gate,
     /// Whether new proposals move by themselves.
     automatic: &'a mut bool,
@@ -248,6 +270,9 @@ impl Executor<'_> {
                 message = self.proposals.recv() => self.on_proposal(message),
                 message = self.confirmations.recv() => self.on_confirmation(message),
                 (call, _) = self.home.recv() => self.on_home(call),
+                goal = self.goals.recv() => self.on_goal(goal),
+                () = cancel_of(&self.goal) => self.on_goal_cancel(),
+                Some(phase) = self.phases.recv() => self.say_phase(phase),
                 (cause, stopped, ended) = end_of(&mut self.motion) => self.on_end(cause, stopped, ended),
                 () = sleep_until(deadline) => self.ask_again(),
                 _ = diagnostics.tick() => self.diagnose(),
@@ -313,7 +338,113 @@ impl Executor<'_> {
                 }
             }
         }
+        self.look_after_goal();
         self.ask_again();
+    }
+
+    /// A goal of the action is a proposal whose way its client follows; it goes through the same gate.
+    fn on_goal(&mut self, new: NewGoal<ExecutePickPlace>) {
+        let id = new.goal.proposal.id;
+        let busy = match (&self.goal, &self.motion) {
+            (Some(goal), _) => Some(format!("a goal for proposal {} is active", goal.id)),
+            (None, Some(motion)) => Some(match motion.cause {
+                Cause::Proposal(moving) => format!("proposal {moving} is being carried out"),
+                Cause::Home => "the arm is on its way home".to_owned(),
+            }),
+            (None, None) => None,
+        };
+        let open = match busy {
+            Some(busy) => Err(busy),
+            None => match self.gate.propose(id, read_proposal(&new.goal.proposal)) {
+                Proposed::Invalid(reason) => Err(reason),
+                Proposed::Open | Proposed::Repeated => self.gate.open(id),
+            },
+        };
+        if let Err(reason) = open {
+            let reason = format!("goal for proposal {id} rejected: {reason}");
+            new.reject(&reason);
+            let refusal = self.result(id, sctn_msgs::StepResult::REFUSED, reason, None);
+            self.results.publish(refusal);
+            return;
+        }
+        info!("proposal {id}: a goal of the action");
+        self.goal = Some(Goal {
+            id,
+            running: new.accept().1,
+            moving: false,
+            cancelling: false,
+        });
+        if *self.automatic {
+            self.confirm(id, Decision::Approve, None);
+        } else {
+            self.feedback(ExecutePickPlaceFeedback::AWAITING_APPROVAL);
+        }
+        self.ask_again();
+    }
+
+    fn on_goal_cancel(&mut self) {
+        let Some(goal) = &mut self.goal else {
+            return;
+        };
+        goal.cancelling = true;
+        let (id, moving) = (goal.id, goal.moving);
+        info!("proposal {id}: its goal is cancelled");
+        match &self.motion {
+            Some(motion) if moving => motion.stop.cancel(),
+            _ => {
+                self.gate.withdraw(id);
+                let reason = "the goal was cancelled; nothing was moving".to_owned();
+                self.report(id, sctn_msgs::StepResult::STOPPED, reason, None);
+            }
+        }
+    }
+
+    /// Ends a goal whose proposal can no longer be approved.
+    fn look_after_goal(&mut self) {
+        if let Some(goal) = &self.goal
+            && !goal.moving
+            && let Err(reason) = self.gate.open(goal.id)
+        {
+            self.report(goal.id, sctn_msgs::StepResult::REFUSED, reason, None);
+        }
+    }
+
+    /// Ends the goal of a proposal with its result, if it has one and this is its end.
+    fn finish_goal(&mut self, result: sctn_msgs::StepResult, motion_ended: bool) {
+        use sctn_msgs::StepResult;
+        let is_end =
+            |goal: &mut Goal| goal.id == result.proposal_id && (motion_ended || !goal.moving);
+        let Some(goal) = self.goal.take_if(is_end) else {
+            return;
+        };
+        // Nothing moves for a goal that has ended.
+        self.gate.withdraw(goal.id);
+        let (outcome, cancelled) = (result.outcome, goal.running.is_cancel_requested());
+        let result = ExecutePickPlaceResult { result };
+        match outcome {
+            StepResult::PLACED => goal.running.succeed(result),
+            StepResult::STOPPED if cancelled => goal.running.cancelled(result),
+            _ => goal.running.abort(result),
+        }
+    }
+
+    fn say_phase(&self, phase: Phase) {
+        if self.goal.as_ref().is_some_and(|goal| goal.moving) {
+            self.feedback(convert::phase_to_msg(phase));
+        }
+    }
+
+    fn feedback(&self, phase: u8) {
+        if let Some(goal) = &self.goal {
+            goal.running.feedback(ExecutePickPlaceFeedback {
+                header: msgs::std_msgs::Header {
+                    stamp: self.node.now(),
+                    frame_id: self.parameters.world_frame.clone(),
+                },
+                proposal_id: goal.id,
+                phase,
+            });
+        }
     }
 
     fn on_confirmation(&mut self, message: sctn_msgs::StepConfirmation) {
@@ -408,16 +539,23 @@ impl Executor<'_> {
             }
             Verdict::Nothing => {}
         }
+        self.look_after_goal();
     }
 
     fn begin(&mut self, proposal: Proposal) {
         info!("proposal {}: moving", proposal.id);
+        if let Some(goal) = &mut self.goal {
+            goal.moving = goal.id == proposal.id;
+        }
+        let phases = self.phase_sender.clone();
         let arm = self.work_cell.arm.clone();
         let diagnostics = self.node.diagnostics().clone();
         let id = proposal.id;
         let observe = move |phase: Phase| {
             let values = [("proposal_id", id.to_string())];
             diagnostics.set("motion", Level::Ok, format!("{phase:?}"), values);
+            // The receiver lives as long as the node.
+            let _ = phases.send(phase);
         };
         self.start(Cause::Proposal(id), move |robot| {
             let Proposal {
@@ -488,6 +626,9 @@ impl Executor<'_> {
 
     fn on_end(&mut self, cause: Cause, stopped: bool, ended: anyhow::Result<Ended>) {
         use sctn_msgs::StepResult;
+        while let Ok(phase) = self.phases.try_recv() {
+            self.say_phase(phase);
+        }
         let (result, stamps) = match ended {
             Ok(ended) => (Ok(ended.result), ended.stamps),
             Err(error) => (Err(error), None),
@@ -543,7 +684,13 @@ impl Executor<'_> {
     }
 
     /// `motion`: when it ended and how long it took.
-    fn report(&self, id: u64, outcome: u8, reason: String, motion: Option<(Duration, Duration)>) {
+    fn report(
+        &mut self,
+        id: u64,
+        outcome: u8,
+        reason: String,
+        motion: Option<(Duration, Duration)>,
+    ) {
         use sctn_msgs::StepResult;
         match outcome {
             StepResult::PLACED | StepResult::REJECTED => {
@@ -552,11 +699,23 @@ impl Executor<'_> {
             StepResult::FAULT => error!("proposal {id}: {}: {reason}", name(outcome)),
             _ => warn!("proposal {id}: {}: {reason}", name(outcome)),
         }
+        let result = self.result(id, outcome, reason, motion);
+        self.results.publish(result.clone());
+        self.finish_goal(result, motion.is_some());
+    }
+
+    fn result(
+        &self,
+        id: u64,
+        outcome: u8,
+        reason: String,
+        motion: Option<(Duration, Duration)>,
+    ) -> sctn_msgs::StepResult {
         let (end, duration) = match motion {
             Some((end, duration)) => (convert::time_to_msg(end).ok(), duration),
             None => (None, Duration::ZERO),
         };
-        self.results.publish(StepResult {
+        sctn_msgs::StepResult {
             header: msgs::std_msgs::Header {
                 stamp: end.unwrap_or_else(|| self.node.now()),
                 frame_id: self.parameters.world_frame.clone(),
@@ -565,7 +724,7 @@ impl Executor<'_> {
             outcome,
             reason,
             duration: convert::duration_to_msg(duration).unwrap_or_default(),
-        });
+        }
     }
 
     fn diagnose(&self) {
@@ -593,6 +752,14 @@ async fn end_of(motion: &mut Option<Motion>) -> (Cause, bool, anyhow::Result<End
             (cause, stopped, ended)
         }
         None => std::future::pending().await,
+    }
+}
+
+/// Waits until the client of a goal wants it cancelled; says so once.
+async fn cancel_of(goal: &Option<Goal>) {
+    match goal {
+        Some(goal) if !goal.cancelling => goal.running.cancel_requested().await,
+        _ => std::future::pending().await,
     }
 }
 

@@ -32,6 +32,12 @@ pub enum RenderError {
     /// The camera cannot take pictures.
     #[error(transparent)]
     Camera(#[from] CameraError),
+    /// Pictures are rendered through a pinhole.
+    #[error("camera {camera} has a lens with distortion, expected a pinhole")]
+    Lens {
+        /// Name of the camera.
+        camera: String,
+    },
     /// An instance shows a mesh of another scene.
     #[error("instance {instance} shows a mesh that the scene does not have")]
     Mesh {
@@ -215,6 +221,11 @@ impl Rasteriser {
     ) -> Result<(), RenderError> {
         camera.check()?;
         let intrinsics = &camera.intrinsics;
+        if !intrinsics.distortion.is_none() {
+            return Err(RenderError::Lens {
+                camera: camera.name.clone(),
+            });
+        }
         let (width, height) = (intrinsics.width, intrinsics.height);
         let len = width * height;
         for (what, actual, expected) in [

@@ -24,7 +24,7 @@ pub struct Settings {
 }
 
 /// In the order in which they go to work: the first goal comes when all others are there.
-const NODES: [&str; 5] = [
+pub const NODES: [&str; 5] = [
     "sim_workcell",
     "camera_fusion",
     "gctn_policy",
@@ -79,6 +79,21 @@ impl Settings {
     }
 }
 
+/// Starts one of [`NODES`] in this process.
+pub fn start(
+    context: &Context,
+    node: &str,
+    arguments: &RosArguments,
+) -> Result<JoinHandle<Result<()>>> {
+    match node {
+        "sim_workcell" => context.start(node, arguments, sim_workcell::configure),
+        "camera_fusion" => context.start(node, arguments, camera_fusion::configure),
+        "goal_oracle" => context.start(node, arguments, goal_oracle::configure),
+        "gctn_policy" => context.start(node, arguments, gctn_policy::configure),
+        _ => context.start(node, arguments, suction_executor::configure),
+    }
+}
+
 /// The running nodes.
 pub enum Graph {
     Composed(Vec<(&'static str, JoinHandle<Result<()>>)>),
@@ -94,14 +109,7 @@ impl Graph {
         let mut tasks = Vec::new();
         for node in NODES {
             let (arguments, _) = RosArguments::parse(settings.arguments(root, node))?;
-            let task = match node {
-                "sim_workcell" => context.start(node, &arguments, sim_workcell::configure),
-                "camera_fusion" => context.start(node, &arguments, camera_fusion::configure),
-                "goal_oracle" => context.start(node, &arguments, goal_oracle::configure),
-                "gctn_policy" => context.start(node, &arguments, gctn_policy::configure),
-                _ => context.start(node, &arguments, suction_executor::configure),
-            };
-            tasks.push((node, task?));
+            tasks.push((node, start(context, node, &arguments)?));
         }
         Ok(Self::Composed(tasks))
     }

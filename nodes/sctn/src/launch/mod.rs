@@ -1,6 +1,6 @@
 //! `sctn launch`: the whole graph on a problem's seed, under an operator, recorded.
 
-mod graph;
+pub mod graph;
 mod operator;
 mod recording;
 

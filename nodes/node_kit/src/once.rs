@@ -1,0 +1,79 @@
+//! Requests that are carried out once, however often they come: a reply can be lost, and a caller
+//! that asks again must not do a thing twice.
+
+use std::collections::VecDeque;
+
+/// Answers that are kept.
+const ANSWERS: usize = 64;
+/// Longest id of a request.
+const MAX_ID: usize = 64;
+
+/// The answers to the last requests, by the ids that their callers chose.
+#[derive(Clone, Debug)]
+pub struct Once<R> {
+    answers: VecDeque<(String, R)>,
+}
+
+/// A request without a proper id.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[error(
+    "request_id is {0:?}, expected 1 to {MAX_ID} printable ASCII characters, for instance a UUID"
+)]
+pub struct InvalidRequestId(String);
+
+impl<R> Default for Once<R> {
+    fn default() -> Self {
+        Self {
+            answers: VecDeque::new(),
+        }
+    }
+}
+
+impl<R: Clone> Once<R> {
+    /// What this request was answered before; nothing where it is new.
+    pub fn answered(&self, request_id: &str) -> Result<Option<R>, InvalidRequestId> {
+        let good = |byte: u8| byte.is_ascii_graphic() || byte == b' ';
+        if !(1..=MAX_ID).contains(&request_id.len()) || !request_id.bytes().all(good) {
+            let shown = request_id.chars().take(MAX_ID).collect();
+            return Err(InvalidRequestId(shown));
+        }
+        let known = self.answers.iter().find(|(known, _)| known == request_id);
+        Ok(known.map(|(_, answer)| answer.clone()))
+    }
+
+    /// Keeps an answer for when the request comes again.
+    pub fn remember(&mut self, request_id: &str, answer: R) {
+        if self.answers.len() == ANSWERS {
+            self.answers.pop_front();
+        }
+        self.answers.push_back((request_id.to_owned(), answer));
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_request_that_comes_again_has_the_same_answer_and_old_ones_are_forgotten() {
+        let mut once = Once::default();
+        assert_eq!(once.answered("a"), Ok(None));
+        once.remember("a", 1);
+        assert_eq!(once.answered("a"), Ok(Some(1)));
+        assert_eq!(once.answered("b"), Ok(None));
+        for number in 0..ANSWERS {
+            once.remember(&format!("later {number}"), 2);
+        }
+        assert_eq!(once.answered("a"), Ok(None));
+        assert_eq!(once.answers.len(), ANSWERS);
+    }
+
+    #[test]
+    fn an_id_that_is_none_is_refused() {
+        let once = Once::<u8>::default();
+        for id in ["", "a\nb", "\u{1}", "größer", &"x".repeat(MAX_ID + 1)] {
+            let error = once.answered(id).unwrap_err().to_string();
+            assert!(error.contains("request_id"), "{error}");
+        }
+    }
+}

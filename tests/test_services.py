@@ -1,0 +1,287 @@
+"""Services and the action beside the topics, called from rclpy as anybody would, and twice where a reply could be lost."""
+
+from __future__ import annotations
+
+import pathlib
+import uuid
+
+import numpy as np
+import pytest
+from action_msgs.msg import GoalStatus
+from geometry_msgs.msg import Pose2D
+from rclpy.action import ActionClient
+from rclpy.client import Client
+from sctn_msgs.action import ExecutePickPlace
+from sctn_msgs.msg import Goal, Heightmap, PickPlace, PrimitiveSettings, StepConfirmation, StepResult
+from sctn_msgs.srv import CaptureGoal, LoadDemonstration, ResetCell, SetStep
+
+from cell_operator import Operator, nanoseconds
+from processes import free_domain
+
+SETTINGS = PrimitiveSettings(
+    clearance_m=0.12, lift_m=0.08, travel_m_s=0.5, carry_m_s=0.25, descend_m_s=0.05, acceleration_m_s2=1.0
+)
+
+
+class Cell:
+    """The simulated cell, fusion, oracle and executor, and a test in the place of policy and operator."""
+
+    def __init__(self, operator: Operator) -> None:
+        self.operator = operator
+        node = operator.node
+        self.load = node.create_client(LoadDemonstration, "goal_oracle/load_demonstration")
+        self.capture = node.create_client(CaptureGoal, "goal_oracle/capture_goal")
+        self.set_step = node.create_client(SetStep, "goal_oracle/set_step")
+        self.reset = node.create_client(ResetCell, "sim_workcell/reset")
+        self.execute = ActionClient(node, ExecutePickPlace, "execute_pick_place")
+        self._id = 1000
+
+    def wait_until_ready(self) -> None:
+        ends = [self.load, self.capture, self.set_step, self.reset]
+        self.operator.until(
+            lambda: all(client.service_is_ready() for client in ends) and self.execute.server_is_ready(), "servers", 60.0
+        )
+        self.operator.next("heightmap")
+        self.operator.next("joint_states")
+
+    def call(self, client: Client, request: object) -> object:
+        """Asks again where no reply comes, under the same id: the first can be lost while the ends still meet."""
+        for _ in range(5):
+            future = client.call_async(request)
+            try:
+                self.operator.until(future.done, f"reply of {client.srv_name}", 5.0)
+                return future.result()
+            except TimeoutError:
+                client.remove_pending_request(future)
+        raise TimeoutError(f"no reply of {client.srv_name}")
+
+    def heightmap(self) -> Heightmap:
+        return self.operator.newest("heightmap")
+
+    def proposal(self, **changes: object) -> PickPlace:
+        """A good proposal of our own, from the present heightmap."""
+        self._id += 1
+        fields = {
+            "header": self.heightmap().header,
+            "id": self._id,
+            "problem": "placing",
+            "step": 1,
+            "pick": Pose2D(x=0.5, y=0.2, theta=0.0),
+            "place": Pose2D(x=0.5, y=-0.2, theta=0.0),
+            "settings": SETTINGS,
+            "module": "placing",
+        }
+        return PickPlace(**{**fields, **changes})
+
+    def send(self, proposal: PickPlace) -> tuple[object, list[ExecutePickPlace.Feedback]]:
+        """Sends a goal; its handle, and a list that fills with feedback."""
+        feedback: list[ExecutePickPlace.Feedback] = []
+        sending = self.execute.send_goal_async(
+            ExecutePickPlace.Goal(proposal=proposal), feedback_callback=lambda message: feedback.append(message.feedback)
+        )
+        self.operator.until(sending.done, "answer to the goal", 20.0)
+        return sending.result(), feedback
+
+    def result(self, handle: object) -> object:
+        future = handle.get_result_async()
+        self.operator.until(future.done, "result of the goal", 60.0)
+        return future.result()
+
+    def awaits_approval(self, feedback: list[ExecutePickPlace.Feedback]) -> None:
+        waiting = ExecutePickPlace.Feedback.AWAITING_APPROVAL
+        self.operator.until(lambda: any(message.phase == waiting for message in feedback), "feedback", 10.0)
+
+
+@pytest.fixture(scope="module")
+def demonstration(start_for_module, tmp_path_factory: pytest.TempPathFactory) -> pathlib.Path:
+    """The folder of one demonstration of placing."""
+    out = tmp_path_factory.mktemp("demonstrations")
+    demos = start_for_module("sctn", "demos", "--problem", "placing", "--episodes", 1, "--seed", 0, "--out", out)
+    assert demos.wait(120.0) == 0, demos.log()
+    return out / "placing" / "000000"
+
+
+@pytest.fixture(scope="module")
+def cell(start_for_module, operator_for_module: Operator) -> Cell:
+    start_for_module("sim_workcell", "--ros-args", "-p", "problem:=placing", "-p", "seed:=10000")
+    start_for_module("camera_fusion", "--ros-args", "-p", "use_sim_time:=true")
+    start_for_module("goal_oracle", "--ros-args", "-p", "use_sim_time:=true", "-p", "start_empty:=true")
+    start_for_module("suction_executor", "--ros-args", "-p", "use_sim_time:=true")
+    cell = Cell(operator_for_module)
+    cell.wait_until_ready()
+    return cell
+
+
+def name() -> str:
+    return str(uuid.uuid4())
+
+
+def newest_goal(cell: Cell, after: int, **fields: object) -> Goal:
+    return cell.operator.next(
+        "goal", after, lambda goal: all(getattr(goal, field) == value for field, value in fields.items()), 20.0
+    )
+
+
+def test_a_sequence_is_taught_from_nothing_and_a_repeated_call_captures_nothing_more(cell: Cell) -> None:
+    refused = cell.call(cell.capture, CaptureGoal.Request(request_id=name()))
+    assert not refused.success
+    assert "settings" in refused.message
+    goals = cell.operator.count("goal")
+    request = CaptureGoal.Request(request_id=name(), append=True, module="placing", settings=SETTINGS)
+    first = cell.call(cell.capture, request)
+    assert first.success, first.message
+    assert (first.step, first.step_count) == (1, 1)
+    goal = newest_goal(cell, goals, step=1, step_count=1)
+    assert np.array_equal(goal.heightmap.height_m, cell.heightmap().height_m)
+    assert goal.heightmap.views == 3
+    assert cell.call(cell.capture, request) == first
+    second = cell.call(cell.capture, CaptureGoal.Request(request_id=name(), append=True))
+    assert (second.step, second.step_count) == (2, 2)
+
+
+def test_a_demonstration_is_loaded_and_what_is_none_is_refused_by_its_path(cell: Cell, demonstration: pathlib.Path) -> None:
+    refused = cell.call(cell.load, LoadDemonstration.Request(request_id=name(), path="/no/such/bag"))
+    assert not refused.success
+    assert "/no/such/bag" in refused.message
+    goals = cell.operator.count("goal")
+    loaded = cell.call(cell.load, LoadDemonstration.Request(request_id=name(), path=str(demonstration)))
+    assert loaded.success, loaded.message
+    assert loaded.demonstration == "placing/0"
+    goal = newest_goal(cell, goals, demonstration="placing/0", step=1)
+    assert goal.step_count == loaded.step_count > 1
+
+
+def test_the_step_is_set_and_one_that_is_not_there_is_refused(cell: Cell, demonstration: pathlib.Path) -> None:
+    loaded = cell.call(cell.load, LoadDemonstration.Request(request_id=name(), path=str(demonstration)))
+    goals = cell.operator.count("goal")
+    request = SetStep.Request(request_id=name(), step=2)
+    first = cell.call(cell.set_step, request)
+    assert first.success
+    assert (first.step, first.step_count) == (2, loaded.step_count)
+    newest_goal(cell, goals, step=2)
+    # The same call again, after somebody else's: answered as before, and nothing changes.
+    cell.call(cell.set_step, SetStep.Request(request_id=name(), step=1))
+    assert cell.call(cell.set_step, request) == first
+    present = cell.call(cell.set_step, SetStep.Request(request_id=name(), step=1))
+    assert present.step == 1
+    for step in (0, loaded.step_count + 1):
+        refused = cell.call(cell.set_step, SetStep.Request(request_id=name(), step=step))
+        assert not refused.success
+        assert f"step is {step}" in refused.message
+
+
+def test_the_cell_is_reset_to_a_seed_once_and_time_goes_on(cell: Cell) -> None:
+    before = cell.heightmap()
+    request = ResetCell.Request(request_id=name(), seed=10002)
+    first = cell.call(cell.reset, request)
+    assert first.success, first.message
+    assert nanoseconds(first.stamp) > nanoseconds(before.header.stamp)
+    after = cell.operator.next("heightmap", 0, lambda made: nanoseconds(made.header.stamp) >= nanoseconds(first.stamp), 20.0)
+    assert not np.array_equal(after.height_m, before.height_m)
+    heightmaps = cell.operator.count("heightmap")
+    assert cell.call(cell.reset, request) == first
+    cell.operator.spin(1.5)
+    assert cell.operator.count("heightmap") == heightmaps
+    # The scene that was there before is there again.
+    again = cell.call(cell.reset, ResetCell.Request(request_id=name(), seed=10000))
+    same = cell.operator.next("heightmap", 0, lambda made: nanoseconds(made.header.stamp) >= nanoseconds(again.stamp), 20.0)
+    assert np.array_equal(same.height_m, before.height_m)
+    refused = cell.call(cell.reset, ResetCell.Request(request_id=name(), problem="no_such_problem"))
+    assert not refused.success
+    assert "no_such_problem" in refused.message
+
+
+@pytest.mark.parametrize("client", ["load", "capture", "set_step", "reset"])
+def test_a_request_without_an_id_is_refused(cell: Cell, client: str) -> None:
+    client = getattr(cell, client)
+    refused = cell.call(client, client.srv_type.Request())
+    assert not refused.success
+    assert "request_id" in refused.message
+
+
+def test_a_goal_waits_for_its_approval_and_says_its_phases(cell: Cell) -> None:
+    proposal = cell.proposal()
+    handle, feedback = cell.send(proposal)
+    assert handle.accepted
+    cell.awaits_approval(feedback)
+    home = np.array(cell.operator.newest("joint_states").position)
+    cell.operator.spin(1.0)
+    assert np.abs(np.array(cell.operator.newest("joint_states").position) - home).max() < 1e-4
+    cell.operator.confirm(proposal.id, StepConfirmation.APPROVE)
+    end = cell.result(handle)
+    result = end.result.result
+    assert result.proposal_id == proposal.id
+    succeeded = end.status == GoalStatus.STATUS_SUCCEEDED
+    assert succeeded == (result.outcome == StepResult.PLACED), result
+    assert result.outcome in (StepResult.PLACED, StepResult.NO_CONTACT, StepResult.GRASP_FAILED)
+    phases = [message.phase for message in feedback]
+    assert phases == sorted(phases)
+    assert {0, 1, 2, 10} <= set(phases) <= set(range(11))
+    # The topic says the same.
+    assert cell.operator.next("step_result", 0, lambda said: said.proposal_id == proposal.id) == result
+    # A late question for the result has the same answer.
+    assert cell.result(handle).result.result == result
+
+
+def test_one_goal_runs_and_others_are_rejected_with_a_reason(cell: Cell) -> None:
+    first, feedback = cell.send(cell.proposal())
+    cell.awaits_approval(feedback)
+    others = [cell.proposal() for _ in range(2)]
+    for other in others:
+        handle, _ = cell.send(other)
+        assert not handle.accepted
+        answer = cell.operator.next("step_result", 0, lambda said: said.proposal_id == other.id)
+        assert answer.outcome == StepResult.REFUSED
+        assert "is active" in answer.reason
+    cancelling = first.cancel_goal_async()
+    cell.operator.until(cancelling.done, "answer to the cancel", 20.0)
+    end = cell.result(first)
+    assert end.status == GoalStatus.STATUS_CANCELED
+    assert end.result.result.outcome == StepResult.STOPPED
+    # What was cancelled cannot be approved any more.
+    proposal_id = end.result.result.proposal_id
+    after = cell.operator.count("step_result")
+    cell.operator.confirm(proposal_id, StepConfirmation.APPROVE)
+    refused = cell.operator.next("step_result", after, lambda said: said.proposal_id == proposal_id)
+    assert refused.outcome == StepResult.REFUSED
+    assert "withdrawn" in refused.reason
+
+
+def test_a_goal_that_the_gate_refuses_moves_nothing(cell: Cell) -> None:
+    bad, _ = cell.send(cell.proposal(pick=Pose2D(x=0.9, y=0.0, theta=0.0)))
+    assert not bad.accepted
+    rejected = cell.proposal()
+    handle, feedback = cell.send(rejected)
+    cell.awaits_approval(feedback)
+    cell.operator.confirm(rejected.id, StepConfirmation.REJECT)
+    end = cell.result(handle)
+    assert end.status == GoalStatus.STATUS_ABORTED
+    assert end.result.result.outcome == StepResult.REJECTED
+
+
+def test_without_required_approvals_a_goal_moves_at_once_and_a_cancel_stops_the_arm_where_it_is(start) -> None:
+    domain = free_domain()
+    start("sim_workcell", "--ros-args", "-p", "real_time_factor:=1.0", domain=domain)
+    start("camera_fusion", "--ros-args", "-p", "use_sim_time:=true", domain=domain)
+    start("suction_executor", "--ros-args", "-p", "use_sim_time:=true", "-p", "require_approval:=false", domain=domain)
+    with Operator(domain) as operator:
+        cell = Cell(operator)
+        operator.until(cell.execute.server_is_ready, "action server", 60.0)
+        operator.next("heightmap")
+        operator.next("joint_states")
+        home = np.array(operator.newest("joint_states").position)
+        handle, feedback = cell.send(cell.proposal())
+        assert handle.accepted
+        operator.until(lambda: feedback, "phase", 20.0)
+        assert feedback[0].phase == ExecutePickPlace.Feedback.APPROACH
+        operator.spin(0.5)
+        cancelling = handle.cancel_goal_async()
+        operator.until(cancelling.done, "answer to the cancel", 20.0)
+        end = cell.result(handle)
+        assert end.status == GoalStatus.STATUS_CANCELED
+        assert end.result.result.outcome == StepResult.STOPPED
+        operator.spin(0.2)
+        stopped = np.array(operator.newest("joint_states").position)
+        assert np.abs(stopped - home).max() > 1e-3
+        operator.spin(1.0)
+        assert np.array_equal(np.array(operator.newest("joint_states").position), stopped)

@@ -52,9 +52,7 @@ def measure(count: int) -> dict[str, float]:
 
                 def until_there_are(heightmaps: int, limit_s: float) -> None:
                     deadline = time.monotonic() + limit_s
-                    while len(ages) < heightmaps:
-                        if time.monotonic() > deadline:
-                            raise TimeoutError(f"{len(ages)} of {heightmaps} heightmaps within {limit_s} s\n{fusion.log()}")
+                    while len(ages) < heightmaps and time.monotonic() < deadline:
                         cameras.publish()
                         before, end = len(ages), time.monotonic() + 0.3
                         while len(ages) == before and time.monotonic() < end:
@@ -68,20 +66,23 @@ def measure(count: int) -> dict[str, float]:
                     return sent[-1], len(ages)
 
                 # The ends meet, and everything runs for the second time.
-                until_there_are(5, 60.0)
+                until_there_are(5, 30.0)
                 sent_before, came_before = counts()
-                until_there_are(came_before + count, 60.0 + count)
+                until_there_are(came_before + count, 20.0 + count)
                 latencies = sorted(ages[came_before:])
                 sent_after, came_after = counts()
         finally:
             fusion.end()
-    return {
+    figures = {
+        "sent": sent_after - sent_before,
         "count": len(latencies),
         "lost": (sent_after - sent_before) - (came_after - came_before),
-        "median_s": statistics.median(latencies),
-        "p99_s": latencies[min(len(latencies) - 1, round(0.99 * len(latencies)))],
-        "max_s": latencies[-1],
     }
+    if latencies:
+        figures["median_s"] = statistics.median(latencies)
+        figures["p99_s"] = latencies[min(len(latencies) - 1, round(0.99 * len(latencies)))]
+        figures["max_s"] = latencies[-1]
+    return figures
 
 
 def main() -> None:

@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from typing import Any
 
 import pytest
+from action_msgs.msg import GoalStatus
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
@@ -26,8 +27,10 @@ from rcl_interfaces.srv import (
     SetParameters,
     SetParametersAtomically,
 )
+from rclpy.action import ActionClient, ActionServer
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
+from sctn_msgs.action import ExecutePickPlace
 from sctn_msgs.msg import Heightmap, Reward
 from sensor_msgs.msg import CameraInfo
 
@@ -116,6 +119,49 @@ def test_every_service_goes_both_ways_unchanged_also_repeated(echo: Process, pee
             peer.until(lambda answers=answers, answer=answer: answer[0] in answers, f"answer to {topic}", 30.0)
             assert request in heard
     assert "SetParameters" in names
+
+
+def test_the_action_goes_both_ways_unchanged_with_feedback(echo: Process, peer: Peer) -> None:
+    chance = random.Random(3)
+    kind, topic = ExecutePickPlace, "sctn_msgs/ExecutePickPlace"
+    # rclpy asks, we carry it out.
+    asked = peer.listen(kind.Goal, f"asked/{topic}")
+    feedback, result = peer.speak(kind.Feedback, f"feedback/{topic}"), peer.speak(kind.Result, f"result/{topic}")
+    client = ActionClient(peer.node, kind, f"served/{topic}")
+    assert client.wait_for_server(20.0)
+    for _ in range(ROUNDS):
+        goal, said, end = filled(kind.Goal, chance), filled(kind.Feedback, chance), filled(kind.Result, chance)
+        feedback.publish(said)
+        result.publish(end)
+        heard: list[Any] = []
+
+        def carried_out(goal=goal, said=said, end=end, heard=heard) -> bool:
+            # What is to be said goes another way than the goal.
+            sending = client.send_goal_async(goal, feedback_callback=lambda message: heard.append(message.feedback))
+            handle = peer.wait(sending, "answer to the goal")
+            back = peer.wait(handle.get_result_async(), "result")
+            return back.status == GoalStatus.STATUS_SUCCEEDED and back.result == end and said in heard
+
+        peer.until(carried_out, "right result and feedback")
+        peer.until(lambda goal=goal: goal in asked, "goal")
+    # We ask, rclpy carries it out.
+    goals: list[Any] = []
+    answer = [kind.Result()]
+
+    def carry_out(handle: Any) -> Any:
+        goals.append(handle.request)
+        handle.succeed()
+        return answer[0]
+
+    server = ActionServer(peer.node, kind, f"answer/{topic}", carry_out)
+    answers = peer.listen(kind.Result, f"answered/{topic}")
+    ask = peer.speak(kind.Goal, f"ask/{topic}")
+    for _ in range(ROUNDS):
+        goal, answer[0] = filled(kind.Goal, chance), filled(kind.Result, chance)
+        ask.publish(goal)
+        peer.until(lambda: answer[0] in answers, "result of our goal", 30.0)
+        assert goal in goals
+    server.destroy()
 
 
 def test_a_service_answers_many_calls_at_once_and_the_first_one_too(echo: Process, domain: int) -> None:

@@ -2,7 +2,8 @@
 //!
 //! - Messages: what comes on `echo/PACKAGE/NAME` goes out on `echoed/PACKAGE/NAME`; `latched` to `latched_echoed`.
 //! - Services: `served/PACKAGE/NAME` says on `asked/..` what it was asked and answers what came on `reply/..`; what comes on
-//!   `ask/..` is asked of `answer/..`, and its answer goes out on `answered/..`.
+//!   `ask/..` is asked of `answer/..`, and its answer goes out on `answered/..`. The same for our action, with `feedback/..` and
+//!   `result/..`.
 
 use std::{
     process::ExitCode,
@@ -10,9 +11,9 @@ use std::{
 };
 
 use msgs::{
-    CdrError, Interface, Service, Visitor, from_cdr,
+    Action, CdrError, Interface, Service, Visitor, from_cdr,
     rcl_interfaces::{GetParameters, SetParameters},
-    sctn_msgs::Reward,
+    sctn_msgs::{CaptureGoal, ExecutePickPlace, LoadDemonstration, ResetCell, Reward, SetStep},
     to_cdr,
 };
 use node_kit::{
@@ -45,6 +46,12 @@ impl Active for Echo {
         }
         service::<GetParameters>(node)?;
         service::<SetParameters>(node)?;
+        service::<CaptureGoal>(node)?;
+        service::<LoadDemonstration>(node)?;
+        service::<ResetCell>(node)?;
+        service::<SetStep>(node)?;
+        carry_out::<ExecutePickPlace>(node)?;
+        send::<ExecutePickPlace>(node)?;
         echo_latched(node)?;
         node.deactivated().await;
         Ok(())
@@ -183,6 +190,48 @@ fn call<S: Service + 'static>(node: &Node) -> Result<(), NodeError> {
             let request = asks.recv().await;
             match client.call(&request, &CallOptions::default()).await {
                 Ok(response) => say(&answered, &response),
+                Err(error) => warn!("{error}"),
+            }
+        }
+    });
+    Ok(())
+}
+
+/// An action: `served/..` says on `asked/..` what its goal is, on its feedback what came on `feedback/..`, and
+/// succeeds with what came on `result/..`.
+fn carry_out<A: Action + 'static>(node: &Node) -> Result<(), NodeError> {
+    let name = format!("{}/{}", A::PACKAGE, A::NAME);
+    let mut server = node.action_server::<A>(&format!("served/{name}"))?;
+    let asked = publisher::<A::Goal>(node, &format!("asked/{name}"))?;
+    let feedback = Given::<A::Feedback>::on(node, &format!("feedback/{name}"))?;
+    let result = Given::<A::Result>::on(node, &format!("result/{name}"))?;
+    node.spawn(async move {
+        loop {
+            let goal = server.recv().await;
+            say(&asked, &goal.goal);
+            let (_, running) = goal.accept();
+            running.feedback(feedback.newest());
+            running.succeed(result.newest());
+        }
+    });
+    Ok(())
+}
+
+/// What comes on `ask/..` is sent as a goal to `answer/..`, and its result said on `answered/..`.
+fn send<A: Action + 'static>(node: &Node) -> Result<(), NodeError> {
+    let name = format!("{}/{}", A::PACKAGE, A::NAME);
+    let mut asks = Parts::<A::Goal>::on(node, &format!("ask/{name}"))?;
+    let client = node.action_client::<A>(&format!("answer/{name}"))?;
+    let answered = publisher::<A::Result>(node, &format!("answered/{name}"))?;
+    node.spawn(async move {
+        loop {
+            let goal = asks.recv().await;
+            let end = match client.send_goal(&goal, &CallOptions::default()).await {
+                Ok(sent) => sent.result().await,
+                Err(error) => Err(error),
+            };
+            match end {
+                Ok((_, result)) => say(&answered, &result),
                 Err(error) => warn!("{error}"),
             }
         }

@@ -62,6 +62,7 @@ impl Active for FusionNode {
         self.take_over(changes.borrow_and_update().clone());
         self.views = Views::new(&self.parameters, self.poses.clone());
         self.cameras.clear();
+        self.active_since = Instant::now();
         let mut transforms = node.subscription::<TFMessage>("/tf_static", Qos::Latched)?;
         let (sender, mut arrivals) = mpsc::channel(WAITING_ARRIVALS);
         for (index, camera) in self.parameters.cameras.clone().iter().enumerate() {
@@ -95,6 +96,7 @@ pub struct FusionNode {
     views: Views,
     cameras: Vec<CameraTopics>,
     timeout: Duration,
+    active_since: Instant,
     heightmap: Publisher<sctn_msgs::Heightmap>,
     outputs: Outputs,
     last_fusion: Duration,
@@ -125,6 +127,7 @@ impl FusionNode {
             views: Views::new(&parameters, poses.clone()),
             cameras: Vec::new(),
             timeout: Duration::from_secs_f64(parameters.camera_timeout_s),
+            active_since: Instant::now(),
             heightmap: node.publisher("heightmap", Qos::Latched)?,
             outputs: Outputs::new(node)?,
             last_fusion: Duration::ZERO,
@@ -268,8 +271,10 @@ impl FusionNode {
     /// another. When nothing comes from any, the cell is moving, or gone.
     fn look_for_silent_cameras(&mut self, node: &Node) {
         self.outputs.look(node);
-        let timeout = self.timeout;
+        let (timeout, since) = (self.timeout, self.active_since);
         let recent = |arrival: Option<Instant>| arrival.is_some_and(|at| at.elapsed() <= timeout);
+        // A camera that has not sent yet is given as long to begin.
+        let missed = |arrival: Option<Instant>| arrival.unwrap_or(since).elapsed() > timeout;
         let any = self
             .cameras
             .iter()
@@ -280,7 +285,7 @@ impl FusionNode {
                 ("depth", camera.depth_arrival),
             ]
             .into_iter()
-            .filter(|(_, arrival)| !recent(*arrival))
+            .filter(|(_, arrival)| missed(*arrival))
             .map(|(stream, _)| stream)
             .collect();
             let silent = any && !missing.is_empty();
@@ -300,8 +305,10 @@ impl FusionNode {
             }
             camera.silent = silent || (camera.silent && !missing.is_empty());
             self.views.set_silent(index, camera.silent);
+            let arrive = recent(camera.color_arrival) && recent(camera.depth_arrival);
             let (level, message) = match (missing.is_empty(), any) {
-                (true, _) => (Level::Ok, "images arrive".to_owned()),
+                (true, _) if arrive => (Level::Ok, "images arrive".to_owned()),
+                (true, _) => (Level::Stale, "no image yet".to_owned()),
                 (false, true) => (Level::Error, format!("no {} image", missing.join(" and "))),
                 (false, false) => (Level::Stale, "no camera sends images".to_owned()),
             };

@@ -1,7 +1,6 @@
 //! `sctn bench camera_stream`: three cameras of 1 MB images at 30 Hz into camera_fusion, a process of its own.
 
 use crate::interfaces::free_domain;
-use crate::plain_node::NoParameters;
 use crate::root::Root;
 use anyhow::{Context as _, Result, bail, ensure};
 use heightmap::{Camera, Intrinsics};
@@ -10,7 +9,7 @@ use msgs::diagnostic_msgs::DiagnosticArray;
 use msgs::sctn_msgs::Heightmap;
 use msgs::sensor_msgs::{CameraInfo, Image};
 use msgs::tf2_msgs::TFMessage;
-use node_kit::{Context, Network, Publisher, Qos, RosArguments, Subscription};
+use node_kit::{Context, Network, NoParameters, Publisher, Qos, RosArguments, Subscription};
 use serde::Serialize;
 use sim_workcell::frames::camera_transforms;
 use std::collections::BTreeMap;

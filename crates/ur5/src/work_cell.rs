@@ -253,11 +253,8 @@ impl WorkCell {
     /// Name of the link that all others hang on.
     pub fn root(&self) -> &str {
         let is_child = |link: &str| self.frames.iter().any(|frame| frame.child == link);
-        let parents = self.frames.iter().map(|frame| frame.parent.as_str());
-        parents
-            .filter(|parent| !is_child(parent))
-            .next_back()
-            .unwrap_or_default()
+        let mut parents = self.frames.iter().map(|frame| frame.parent.as_str());
+        parents.find(|parent| !is_child(parent)).unwrap_or_default()
     }
 
     /// What is seen and where in the world at a joint position, for rendering.

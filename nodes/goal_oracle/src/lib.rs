@@ -434,7 +434,7 @@ impl OracleNode {
             heightmap: seen.message.clone(),
             append: request.append,
             module: request.module.clone(),
-            settings: request.settings.clone(),
+            settings: request.settings,
         };
         let captured = self.oracle.capture(capture);
         let (step, change) = captured.map_err(|error| error.to_string())?;

@@ -321,7 +321,7 @@ impl Oracle {
             problem,
             settings: match (given, beside) {
                 (true, _) => settings,
-                (false, Some(goal)) => goal.settings.clone(),
+                (false, Some(goal)) => goal.settings,
                 (false, None) => return Err(CaptureError::NoSettings),
             },
             module: match beside {

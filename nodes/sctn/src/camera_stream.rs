@@ -266,9 +266,8 @@ async fn images_lost(diagnostics: &mut Subscription<DiagnosticArray>) -> Result<
     let report = tokio::time::timeout(Duration::from_secs(10), async {
         loop {
             let array = diagnostics.recv().await;
-            let topics = array.status.into_iter();
-            let topics = topics.filter(|status| status.name == "/camera_fusion: topics");
-            if let Some(status) = topics.last() {
+            let mut statuses = array.status.into_iter();
+            if let Some(status) = statuses.find(|status| status.name == "/camera_fusion: topics") {
                 return status;
             }
         }

@@ -61,11 +61,19 @@ fn no_module_is_solved_by_accident() {
 
 #[test]
 fn a_cable_that_is_pulled_hard_or_whips_keeps_together() {
-    // With four substeps throughout, joints gape by 2.6, 1.6 and 1.3 mm in these.
-    for seed in [100_013, 100_058, 100_163] {
-        for checkup in check_ups("routing", Some(Blind::Bodies), seed..seed + 1) {
-            let joint_error_m = checkup.extremes.joint_error_m;
-            assert!(joint_error_m < 1.2e-3, "seed {seed}: {joint_error_m}");
+    // With four substeps throughout, and all speeds damped alike, joints gaped by 2.6 and 1.6 mm,
+    // and at the speed of stacking a bead reached 2.2 m/s.
+    for (problem, seed) in [
+        ("routing", 100_013),
+        ("routing", 100_058),
+        ("stacking_routing", 100_007),
+    ] {
+        for checkup in check_ups(problem, Some(Blind::Bodies), seed..seed + 1) {
+            let worst = checkup.extremes;
+            assert!(
+                worst.joint_error_m < 1.2e-3 && worst.speed_m_s < 1.5,
+                "{problem}, {seed}: {worst:?}"
+            );
         }
     }
 }

@@ -18,6 +18,10 @@ const BEAD_SUCTION_FORCE_N: f64 = 2.5;
 /// Without damping a chain jitters for seconds, or never rests.
 const LINEAR_DAMPING: f32 = 1.0;
 const ANGULAR_DAMPING: f32 = 5.0;
+/// A bead above this speed is damped the more the faster it is, per second and m/s: a cable dragged
+/// fast cracks like a whip, and nothing else in the engine takes that energy out.
+pub(super) const WHIP_M_S: f64 = 0.6;
+const WHIP_DAMPING: f64 = 400.0;
 
 /// Beads on ball-and-socket joints.
 #[derive(Clone, Debug)]
@@ -117,6 +121,19 @@ impl World {
             }
         });
         speeds.fold(0.0, f64::max)
+    }
+
+    /// Damps beads that whip.
+    pub(super) fn brake_fast_beads(&mut self) {
+        for bead in self.chains.iter().flat_map(|chain| &chain.beads) {
+            let handle = self.bodies[bead.0].handle;
+            let body = &self.physics.bodies[handle];
+            let excess_m_s = (f64::from(body.linvel().length()) - WHIP_M_S).max(0.0);
+            let damping = LINEAR_DAMPING + (WHIP_DAMPING * excess_m_s) as f32;
+            if damping != body.linear_damping() && !body.is_fixed() {
+                self.physics.bodies[handle].set_linear_damping(damping);
+            }
+        }
     }
 
     /// The widest gap of the joints of all chains.

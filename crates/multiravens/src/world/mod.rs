@@ -12,6 +12,7 @@ mod tests;
 pub use bead_chain::BeadChain;
 pub use ur5::Shape;
 
+use bead_chain::WHIP_M_S;
 use convert::{from_point, from_pose, from_vector, to_pose};
 use nalgebra::{Isometry3, Point3, Unit, Vector3};
 use rapier3d::prelude::{
@@ -25,12 +26,10 @@ use suction::Suction;
 /// Physics steps in a second of simulated time.
 pub const STEPS_PER_SECOND: u32 = 480;
 
-/// The engine's substeps of a step, at least and at most. Most when a chain's joint gapes further
-/// than this, ...
+/// The engine's substeps of a step, and as many where a chain's joint gapes further than this or a
+/// bead whips: the cable is pulled hard, or hits something.
 const SUBSTEPS: (usize, usize) = (4, 16);
 const GAPING_M: f64 = 0.8e-3;
-/// ... else as many as keep a bead from moving further than this in one of them.
-const SUBSTEP_TRAVEL_M: f64 = 0.3e-3;
 
 /// Manifold points closer than this count as contact.
 const CONTACT_DISTANCE_M: f32 = 0.2e-3;
@@ -247,23 +246,19 @@ impl World {
     pub fn step(&mut self, tip: &Isometry3<f64>) {
         self.suction.lead(&mut self.physics, tip);
         self.physics.integration_parameters.num_solver_iterations = self.substeps();
+        self.brake_fast_beads();
         self.physics.step();
         self.steps += 1;
     }
 
-    /// Enough for the next step to keep the joints of chains together, where they are pulled hard
-    /// or a bead is fast.
+    /// Enough for the next step to keep the joints of chains together.
     fn substeps(&self) -> usize {
-        let (least, most) = SUBSTEPS;
+        let (usual, strained) = SUBSTEPS;
         let speed_m_s = self.fastest_bead_m_s();
-        if speed_m_s == 0.0 {
-            least
-        } else if self.widest_joint_error_m() > GAPING_M {
-            most
-        } else {
-            let travel_m = speed_m_s / f64::from(STEPS_PER_SECOND);
-            ((travel_m / SUBSTEP_TRAVEL_M).ceil() as usize).clamp(least, most)
-        }
+        // What rests needs no look at its joints.
+        let strains =
+            speed_m_s > WHIP_M_S || speed_m_s > 0.0 && self.widest_joint_error_m() > GAPING_M;
+        if strains { strained } else { usual }
     }
 
     /// Simulated time.

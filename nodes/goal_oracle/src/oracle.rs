@@ -899,7 +899,8 @@ mod tests {
         oracle.result(&result(8, StepResult::PLACED, 6));
         let end = oracle.confirmed(&says(StepConfirmation::ADVANCE, 8));
         assert_eq!(goal(end.unwrap()), (1, 0, 6, true));
-        assert_eq!(goal(oracle.set_step(1).unwrap()), (1, 1, 6, false));
+        // Nothing was proposed since that motion: attempts begin anew.
+        assert_eq!(goal(oracle.set_step(1).unwrap()), (1, 0, 6, false));
     }
 
     #[test]

@@ -234,6 +234,7 @@ async fn by_image_distance_what_is_seen_after_a_motion_says_which_goal_is_next()
     let see = |height_m: f32, sec: i32| {
         let mut header = msgs::std_msgs::Header::default();
         header.stamp.sec = sec;
+        header.frame_id = "world".into();
         let message = msgs::convert::heightmap_to_msg(heightmap(height_m), header, 3, 1.0);
         heightmaps.publish(message.unwrap());
     };

@@ -301,7 +301,9 @@ impl Gate {
     /// Says why a proposal cannot be approved any more; whether it can be now, only [`Self::confirm`] knows.
     pub fn open(&self, id: u64) -> Result<(), String> {
         match (self.fate(id), &self.newest) {
-            (None, _) => Err(format!("proposal {id} is unknown")),
+            (None, _) => Err(self
+                .why_invalid(id)
+                .map_or_else(|| format!("proposal {id} is unknown"), str::to_owned)),
             (Some(Fate::Open), Some(newest)) if newest.id == id => {
                 newest.checked.as_ref().map(drop).map_err(String::clone)
             }

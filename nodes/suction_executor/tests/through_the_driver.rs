@@ -274,6 +274,18 @@ impl Bench {
         within("step_result", self.results.recv()).await
     }
 
+    /// The next result, of this proposal and with this outcome.
+    async fn ended(&mut self, id: u64, outcome: u8) -> StepResult {
+        let result = self.result().await;
+        let reason = &result.reason;
+        assert_eq!(
+            (result.proposal_id, result.outcome),
+            (id, outcome),
+            "{reason}"
+        );
+        result
+    }
+
     async fn joints(&mut self) -> JointState {
         while self.joint_states.try_recv().is_some() {}
         within("joint_states", self.joint_states.recv()).await
@@ -392,14 +404,8 @@ async fn episode(problem: &str) -> Environment {
         bench.decide(id, StepConfirmation::APPROVE);
         let expected = environment.step(&action).unwrap();
 
-        let result = bench.result().await;
         let outcome = convert::outcome_to_msg(expected.outcome);
-        assert_eq!(
-            (result.proposal_id, result.outcome),
-            (id, outcome),
-            "{}",
-            result.reason
-        );
+        let result = bench.ended(id, outcome).await;
         assert!(outcome != StepResult::PLACED || id != 3);
         assert_eq!(
             convert::time_from_msg(&result.header.stamp).unwrap(),
@@ -436,13 +442,7 @@ async fn a_stop_stops_the_arm_and_it_goes_on_neither_by_itself_nor_on_the_old_ap
     bench.decide(1, StepConfirmation::APPROVE);
     bench.until_moving().await;
     bench.decide(1, StepConfirmation::STOP);
-    let result = bench.result().await;
-    assert_eq!(
-        (result.proposal_id, result.outcome),
-        (1, StepResult::STOPPED),
-        "{}",
-        result.reason
-    );
+    bench.ended(1, StepResult::STOPPED).await;
     let stopped = bench.joints().await;
     let home = environment.cell().work_cell().arm.home;
     assert!(stopped.position != home.iter().copied().collect::<Vec<_>>());
@@ -503,13 +503,7 @@ async fn deactivating_during_a_motion_stops_the_arm_and_nothing_moves_until_a_ne
         )
         .await
         .unwrap();
-    let result = bench.result().await;
-    assert_eq!(
-        (result.proposal_id, result.outcome),
-        (1, StepResult::STOPPED),
-        "{}",
-        result.reason
-    );
+    bench.ended(1, StepResult::STOPPED).await;
     let stopped = bench.joints().await;
     // Nobody hears this.
     bench.decide(1, StepConfirmation::APPROVE);
@@ -552,13 +546,7 @@ async fn a_protective_stop_is_a_fault_and_nothing_moves_until_it_is_over() {
     bench.safety_mode.publish(SafetyMode {
         mode: SafetyMode::PROTECTIVE_STOP,
     });
-    let result = bench.result().await;
-    assert_eq!(
-        (result.proposal_id, result.outcome),
-        (1, StepResult::FAULT),
-        "{}",
-        result.reason
-    );
+    let result = bench.ended(1, StepResult::FAULT).await;
     assert!(
         result.reason.contains("PROTECTIVE_STOP"),
         "{}",
@@ -575,11 +563,7 @@ async fn a_protective_stop_is_a_fault_and_nothing_moves_until_it_is_over() {
         &environment.settings().unwrap(),
     );
     bench.decide(2, StepConfirmation::APPROVE);
-    let result = bench.result().await;
-    assert_eq!(
-        (result.proposal_id, result.outcome),
-        (2, StepResult::REFUSED)
-    );
+    let result = bench.ended(2, StepResult::REFUSED).await;
     assert!(
         result.reason.contains("PROTECTIVE_STOP"),
         "{}",
@@ -604,13 +588,7 @@ async fn a_lost_driver_is_a_fault() {
     bench.decide(1, StepConfirmation::APPROVE);
     bench.until_moving().await;
     bench.sim.shutdown();
-    let result = bench.result().await;
-    assert_eq!(
-        (result.proposal_id, result.outcome),
-        (1, StepResult::FAULT),
-        "{}",
-        result.reason
-    );
+    let result = bench.ended(1, StepResult::FAULT).await;
     assert!(!result.reason.is_empty());
     bench.stop().await;
 }
@@ -622,13 +600,7 @@ async fn without_require_approval_a_proposal_moves_once_by_itself_until_a_stop()
     let action = reference().demonstrate().unwrap();
     let (time, settings) = (environment.cell().time(), environment.settings().unwrap());
     let expected = environment.step(&action).unwrap();
-    let result = bench.result().await;
-    assert_eq!(
-        (result.proposal_id, result.outcome),
-        (1, StepResult::PLACED),
-        "{}",
-        result.reason
-    );
+    let result = bench.ended(1, StepResult::PLACED).await;
     assert_eq!(
         convert::time_from_msg(&result.header.stamp).unwrap(),
         expected.time
@@ -653,19 +625,9 @@ async fn without_require_approval_a_proposal_moves_once_by_itself_until_a_stop()
     assert_eq!(bench.joints().await.position, before);
     // An approval that is refused changes nothing about that, one that holds lets it go on.
     bench.decide(99, StepConfirmation::APPROVE);
-    let result = bench.result().await;
-    assert_eq!(
-        (result.proposal_id, result.outcome),
-        (99, StepResult::REFUSED)
-    );
+    bench.ended(99, StepResult::REFUSED).await;
     assert_eq!(bench.joints().await.position, before);
     bench.decide(2, StepConfirmation::APPROVE);
-    let result = bench.result().await;
-    assert_eq!(
-        (result.proposal_id, result.outcome),
-        (2, StepResult::PLACED),
-        "{}",
-        result.reason
-    );
+    bench.ended(2, StepResult::PLACED).await;
     bench.stop().await;
 }

@@ -1118,7 +1118,7 @@ impl Discovery {
       self
         .dcps_publication
         .writer
-        .dispose(&Endpoint_GUID(endpoint_guid), None)
+        .dispose(&Endpoint_GUID(endpoint_guid), Some(Timestamp::now()))
         .unwrap_or_else(|e| error!("Disposing local Writer: {e:?}"));
       #[cfg(feature = "security")]
       self
@@ -1131,7 +1131,7 @@ impl Discovery {
       self
         .dcps_subscription
         .writer
-        .dispose(&Endpoint_GUID(endpoint_guid), None)
+        .dispose(&Endpoint_GUID(endpoint_guid), Some(Timestamp::now()))
         .unwrap_or_else(|e| error!("Disposing local Reader: {e:?}"));
       #[cfg(feature = "security")]
       self
@@ -1807,7 +1807,7 @@ impl Discovery {
       match self
         .dcps_subscription
         .writer
-        .write(reader_data.clone(), None)
+        .write(reader_data.clone(), Some(Timestamp::now()))
       {
         Ok(()) => {
           debug!(
@@ -1925,7 +1925,7 @@ impl Discovery {
       match self
         .dcps_publication
         .writer
-        .write(writer_data.clone(), None)
+        .write(writer_data.clone(), Some(Timestamp::now()))
       {
         Ok(()) => {
           debug!(
@@ -1968,7 +1968,10 @@ impl Discovery {
       return;
     }
 
-    match self.dcps_topic.writer.write(topic_data, None) {
+    match self
+      .dcps_topic
+      .writer
+      .write(topic_data, Some(Timestamp::now())) {
       Ok(()) => {
         debug!("Published topic {topic_name} to DCPSTopic");
       }

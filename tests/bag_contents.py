@@ -1,4 +1,4 @@
-"""What a bag holds, by rosbags; what is published so that a recorder hears it."""
+"""Bags by rosbags: what they hold, and new ones of every kind; what is published so that a recorder hears it."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import pathlib
 
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rosbags.highlevel import AnyReader
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
 from cell_operator import Operator
@@ -13,6 +14,26 @@ from cell_operator import Operator
 STORE = get_typestore(Stores.ROS2_JAZZY)
 # Many messages in a short time: none may fall out of a reader's history.
 DEEP = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.VOLATILE)
+
+# The kinds of bag that rosbag2 writes.
+KINDS = {
+    "mcap": (StoragePlugin.MCAP, None),
+    "mcap zstd": (StoragePlugin.MCAP, CompressionMode.STORAGE),
+    "mcap file": (StoragePlugin.MCAP, CompressionMode.FILE),
+    "mcap messages": (StoragePlugin.MCAP, CompressionMode.MESSAGE),
+    "sqlite": (StoragePlugin.SQLITE3, None),
+    "sqlite file": (StoragePlugin.SQLITE3, CompressionMode.FILE),
+    "sqlite messages": (StoragePlugin.SQLITE3, CompressionMode.MESSAGE),
+}
+
+
+def writer_of(bag: pathlib.Path, kind: str) -> Writer:
+    """What writes a new bag of a kind, by rosbags."""
+    plugin, mode = KINDS[kind]
+    writer = Writer(bag, version=9, storage_plugin=plugin)
+    if mode:
+        writer.set_compression(mode, CompressionFormat.ZSTD)
+    return writer
 
 
 def contents(bag: pathlib.Path, *topics: str) -> list[tuple[str, object]]:

@@ -8,32 +8,17 @@ import pathlib
 import numpy as np
 import pytest
 from rosbags.highlevel import AnyReader
-from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
-from rosbags.typesys import Stores, get_typestore
+
+from bag_contents import KINDS, STORE, writer_of
 
 WHOLE, FAILED, USAGE, DAMAGED = 0, 1, 2, 3
-STORE = get_typestore(Stores.ROS2_JAZZY)
 SCAN = "sensor_msgs/msg/LaserScan"
-
-KINDS = {
-    "mcap": (StoragePlugin.MCAP, None),
-    "mcap zstd": (StoragePlugin.MCAP, CompressionMode.STORAGE),
-    "mcap file": (StoragePlugin.MCAP, CompressionMode.FILE),
-    "mcap messages": (StoragePlugin.MCAP, CompressionMode.MESSAGE),
-    "sqlite": (StoragePlugin.SQLITE3, None),
-    "sqlite messages": (StoragePlugin.SQLITE3, CompressionMode.MESSAGE),
-    "sqlite file": (StoragePlugin.SQLITE3, CompressionMode.FILE),
-}
 
 
 def write_scans(bag: pathlib.Path, kind: str, count: int = 50) -> None:
     """A bag of a type that is none of ours, by rosbags."""
-    plugin, mode = KINDS[kind]
-    writer = Writer(bag, version=9, storage_plugin=plugin)
-    if mode:
-        writer.set_compression(mode, CompressionFormat.ZSTD)
     Scan, Header, Time = (STORE.types[name] for name in (SCAN, "std_msgs/msg/Header", "builtin_interfaces/msg/Time"))
-    with writer:
+    with writer_of(bag, kind) as writer:
         connection = writer.add_connection("/scan", SCAN, typestore=STORE)
         for index in range(count):
             ranges = np.arange(index, index + 100, dtype=np.float32)

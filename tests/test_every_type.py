@@ -15,10 +15,9 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 from rosbags.interfaces import Nodetype
-from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from bag_contents import same
+from bag_contents import KINDS, same, writer_of
 from processes import REPOSITORY
 
 COPIES = 3
@@ -90,24 +89,9 @@ def messages() -> list[tuple[str, bytes]]:
     return [(name, bytes(STORE.serialize_cdr(message(name, chance), name))) for _ in range(COPIES) for name in TYPES]
 
 
-KINDS = {
-    "mcap": (StoragePlugin.MCAP, None),
-    "mcap zstd": (StoragePlugin.MCAP, CompressionMode.STORAGE),
-    "mcap file": (StoragePlugin.MCAP, CompressionMode.FILE),
-    "mcap messages": (StoragePlugin.MCAP, CompressionMode.MESSAGE),
-    "sqlite": (StoragePlugin.SQLITE3, None),
-    "sqlite file": (StoragePlugin.SQLITE3, CompressionMode.FILE),
-    "sqlite messages": (StoragePlugin.SQLITE3, CompressionMode.MESSAGE),
-}
-
-
 def write(bag: pathlib.Path, kind: str, messages: list[tuple[str, bytes]]) -> pathlib.Path:
     """A bag of rosbags, a message a millisecond."""
-    plugin, mode = KINDS[kind]
-    writer = Writer(bag, version=9, storage_plugin=plugin)
-    if mode:
-        writer.set_compression(mode, CompressionFormat.ZSTD)
-    with writer:
+    with writer_of(bag, kind) as writer:
         connections = {name: writer.add_connection(topic_of(name), name, typestore=STORE) for name in TYPES}
         for index, (name, raw) in enumerate(messages):
             writer.write(connections[name], 10**9 + 10**6 * index, raw)

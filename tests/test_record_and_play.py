@@ -12,13 +12,12 @@ import subprocess
 import time
 
 import yaml
-from rosbags.rosbag2 import StoragePlugin, Writer
 from rosgraph_msgs.msg import Clock
 from sctn_msgs.msg import StepResult
 from sensor_msgs.msg import BatteryState
 from std_msgs.msg import String
 
-from bag_contents import DEEP, STORE, contents, wait_for_recorder
+from bag_contents import DEEP, STORE, contents, wait_for_recorder, writer_of
 from cell_operator import EVENT, LATCHED, STREAM, Operator
 from processes import BINARIES, environment
 
@@ -340,7 +339,7 @@ def test_a_bag_of_another_recorder_is_played(start, operator: Operator, tmp_path
 def numbered_bag(bag: pathlib.Path, count: int, hz: int) -> pathlib.Path:
     """An SQLite bag of numbers, by rosbags."""
     text = STORE.types["std_msgs/msg/String"]
-    with Writer(bag, version=9, storage_plugin=StoragePlugin.SQLITE3) as writer:
+    with writer_of(bag, "sqlite") as writer:
         chatter = writer.add_connection("/chatter", text.__msgtype__, typestore=STORE)
         for index in range(count):
             writer.write(chatter, 10**9 + index * 10**9 // hz, STORE.serialize_cdr(text(str(index)), text.__msgtype__))

@@ -572,6 +572,12 @@ def test_a_signal_ends_a_node_cleanly(start, peer: Peer, number: signal.Signals)
     process.signal(number)
     assert process.wait(5.0) == 0
     assert "finalized" in process.errors()
+    peer.until(
+        lambda: ("camera_fusion", namespace) not in peer.node.get_node_names_and_namespaces()
+        and not peer.node.count_publishers(f"{namespace}/heightmap"),
+        "end of the node in rclpy's graph",
+        5.0,
+    )
 
 
 def test_parameter_files_reach_the_nodes_they_name(start, peer: Peer, tmp_path: pathlib.Path) -> None:

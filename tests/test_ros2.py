@@ -31,7 +31,7 @@ from rclpy.action import ActionClient, ActionServer
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
 from sctn_msgs.action import ExecutePickPlace
-from sctn_msgs.msg import Heightmap, Reward
+from sctn_msgs.msg import Heightmap, PickPlace, Reward
 from sensor_msgs.msg import CameraInfo
 
 from peer import BEST_EFFORT, LATCHED, RELIABLE, Peer, filled, interfaces
@@ -162,6 +162,41 @@ def test_the_action_goes_both_ways_unchanged_with_feedback(echo: Process, peer: 
         peer.until(lambda: answer[0] in answers, "result of our goal", 30.0)
         assert goal in goals
     server.destroy()
+
+
+def test_three_goals_run_side_by_side_one_is_cancelled_and_a_late_request_gets_its_result(echo: Process, peer: Peer) -> None:
+    client = ActionClient(peer.node, ExecutePickPlace, "held/sctn_msgs/ExecutePickPlace")
+    assert client.wait_for_server(20.0)
+    said: list[int] = []
+
+    def goal(number: int, tenths_s: int) -> ExecutePickPlace.Goal:
+        return ExecutePickPlace.Goal(proposal=PickPlace(id=number, step=tenths_s))
+
+    def send(number: int, tenths_s: int) -> Any:
+        return client.send_goal_async(
+            goal(number, tenths_s), feedback_callback=lambda message: said.append(message.feedback.proposal_id)
+        )
+
+    sending = [send(1, 600), send(2, 20), send(3, 600)]
+    first, second, third = (peer.wait(sent, "answer to a goal") for sent in sending)
+    assert first.accepted and second.accepted and third.accepted
+    peer.until(lambda: set(said) == {1, 2, 3}, "feedback of all")
+
+    def ended(handle: Any) -> tuple[int, int]:
+        end = peer.wait(handle.get_result_async(), "result")
+        return end.status, end.result.result.proposal_id
+
+    # The one in the middle ends while the others run, and asking twice gives the same.
+    assert ended(second) == (GoalStatus.STATUS_SUCCEEDED, 2)
+    cancelled = peer.wait(third.cancel_goal_async(), "answer to the cancel")
+    assert [bytes(info.goal_id.uuid) for info in cancelled.goals_canceling] == [bytes(third.goal_id.uuid)]
+    assert ended(third) == (GoalStatus.STATUS_CANCELED, 3)
+    time.sleep(1.0)
+    assert ended(second) == (GoalStatus.STATUS_SUCCEEDED, 2)
+    assert ended(third) == (GoalStatus.STATUS_CANCELED, 3)
+    peer.wait(first.cancel_goal_async(), "answer to the cancel")
+    assert ended(first) == (GoalStatus.STATUS_CANCELED, 1)
+    client.destroy()
 
 
 def test_a_service_answers_many_calls_at_once_and_the_first_one_too(echo: Process, domain: int) -> None:

@@ -105,10 +105,9 @@ impl Network {
 
 /// What the nodes of a process have in common.
 ///
-/// Each node has a DDS participant of its own, in one process as in several: a RustDDS participant
-/// that may use loopback only does not hear itself, nodes of one participant take discovery events
-/// from each other, and one event loop would carry all images. Without multicast discovery finds a
-/// dozen participants per host.
+/// Each node has a DDS participant of its own, in one process as in several: nodes of one participant
+/// take discovery events from each other, and one event loop would carry all images. Without multicast
+/// discovery finds a dozen participants per host.
 #[derive(Clone)]
 pub struct Context {
     network: Network,

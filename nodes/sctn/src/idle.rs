@@ -69,13 +69,29 @@ impl Node {
         Ok((user + system) / TICKS_PER_SECOND)
     }
 
-    /// Memory, with its share of what it has in common with others [MB].
-    fn memory_mb(&self) -> Result<f64> {
-        let text = std::fs::read_to_string(format!("/proc/{}/smaps_rollup", self.pid))?;
-        let line = text.lines().find_map(|line| line.strip_prefix("Pss:"));
-        let kilobytes = line.and_then(|line| line.trim().strip_suffix(" kB"));
-        let kilobytes: f64 = kilobytes.context("/proc/PID/smaps_rollup")?.parse()?;
-        Ok(kilobytes * 1024.0 / 1e6)
+    /// Memory, with its share of what it has in common with others, and how much of it is libtorch's code [MB].
+    fn memory_mb(&self) -> Result<(f64, f64)> {
+        let text = std::fs::read_to_string(format!("/proc/{}/smaps", self.pid))?;
+        let (mut all, mut libtorch, mut in_libtorch) = (0.0, 0.0, false);
+        for line in text.lines() {
+            let mut fields = line.split_whitespace();
+            match fields.next() {
+                Some("Pss:") => {
+                    let kilobytes: f64 = fields.next().context("/proc/PID/smaps")?.parse()?;
+                    let megabytes = kilobytes * 1024.0 / 1e6;
+                    all += megabytes;
+                    libtorch += if in_libtorch { megabytes } else { 0.0 };
+                }
+                // A mapping: addresses, permissions, offset, device, inode, file.
+                Some(addresses) if addresses.contains('-') => {
+                    in_libtorch = fields
+                        .nth(4)
+                        .is_some_and(|file| file.contains("/libtorch") || file.contains("/libc10"));
+                }
+                _ => {}
+            }
+        }
+        Ok((all, libtorch))
     }
 }
 
@@ -116,34 +132,29 @@ pub fn run(as_json: bool) -> Result<()> {
     let before = nodes.iter().map(Node::processor_s);
     let before: Vec<f64> = before.collect::<Result<_>>()?;
     std::thread::sleep(MEASURED);
-    let (mut processor, mut memory_mb) = (0.0, 0.0);
+    let (mut processor, mut memory_mb, mut libtorch_mb) = (0.0, 0.0, 0.0);
     let mut each = serde_json::Map::new();
-    for (node, before) in nodes.iter().zip(before) {
-        let used = (node.processor_s()? - before) / started.elapsed().as_secs_f64();
-        let memory = node.memory_mb()?;
+    let said = |name: &str, used: f64, memory: f64, libtorch: f64| {
         if !as_json {
             println!(
-                "{:20} {:5.2} % of a core {memory:7.1} MB",
-                node.name,
+                "{name:20} {:5.2} % of a core {memory:7.1} MB, of it {libtorch:5.1} MB libtorch's code",
                 100.0 * used
             );
         }
+        json!({"processor": used, "memory_mb": memory, "libtorch_mb": libtorch})
+    };
+    for (node, before) in nodes.iter().zip(before) {
+        let used = (node.processor_s()? - before) / started.elapsed().as_secs_f64();
+        let (memory, libtorch) = node.memory_mb()?;
+        each.insert(node.name.clone(), said(&node.name, used, memory, libtorch));
         processor += used;
         memory_mb += memory;
-        let value = json!({"processor": used, "memory_mb": memory});
-        each.insert(node.name.clone(), value);
+        libtorch_mb += libtorch;
     }
+    let mut together = said("together", processor, memory_mb, libtorch_mb);
     if as_json {
-        println!(
-            "{}",
-            json!({"processor": processor, "memory_mb": memory_mb, "nodes": each})
-        );
-    } else {
-        println!(
-            "{:20} {:5.2} % of a core {memory_mb:7.1} MB",
-            "together",
-            100.0 * processor
-        );
+        together["nodes"] = each.into();
+        println!("{together}");
     }
     Ok(())
 }

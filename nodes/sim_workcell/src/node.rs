@@ -38,6 +38,10 @@ use crate::workcell::{Step, Wiring, Workcell};
 const WAITING_COMMANDS: usize = 64;
 /// Simulated time between feedback messages, as the driver's controllers have it.
 const FEEDBACK_PERIOD: Duration = Duration::from_millis(50);
+/// Who commands reads the status; once nobody has for so long, it is repeated less often.
+const ATTENTIVE: Duration = Duration::from_secs(1);
+/// By so much less often.
+const INATTENTIVE_FACTOR: f64 = 5.0;
 
 /// Sets the episode up; what it returns poses as the hardware.
 pub async fn configure(
@@ -285,6 +289,8 @@ struct Hardware {
     frames: Vec<Frame>,
     resets: Once<ResetCellResponse>,
     said_pins: IOStates,
+    /// When the last command ended.
+    last_command: Instant,
     next_status: Instant,
     next_pins: Instant,
     next_frames: Instant,
@@ -361,6 +367,7 @@ impl Hardware {
             _program_running: program_running,
             frames: Vec::new(),
             resets: Once::default(),
+            last_command: Instant::now(),
             next_status: Instant::now(),
             next_pins: Instant::now(),
             next_frames: Instant::now(),
@@ -383,7 +390,13 @@ impl Hardware {
                 .commands
                 .recv_timeout(next.saturating_duration_since(Instant::now()))
             {
-                Ok(command) => self.obey(command)?,
+                Ok(command) => {
+                    self.obey(command)?;
+                    self.last_command = Instant::now();
+                    let soon = self.after(self.status_period_s());
+                    self.next_status = self.next_status.min(soon);
+                    self.next_pins = self.next_pins.min(soon);
+                }
                 Err(mpsc::RecvTimeoutError::Timeout) => {}
                 Err(mpsc::RecvTimeoutError::Disconnected) => break,
             }
@@ -661,14 +674,14 @@ impl Hardware {
                 self.workcell.time(),
             )?);
         }
-        self.next_status = self.after(self.parameters.status_period_s);
+        self.next_status = self.after(self.status_period_s());
         Ok(())
     }
 
     fn say_pins(&mut self) {
         self.said_pins = self.workcell.io_states();
         self.io_states.publish(self.said_pins.clone());
-        self.next_pins = self.after(self.parameters.status_period_s);
+        self.next_pins = self.after(self.status_period_s());
     }
 
     fn say_pins_if_changed(&mut self) {
@@ -693,6 +706,13 @@ impl Hardware {
             camera.publish(frame.clone());
         }
         self.next_frames = self.after(self.parameters.frames_period_s);
+    }
+
+    fn status_period_s(&self) -> f64 {
+        match self.last_command.elapsed() > ATTENTIVE {
+            true => INATTENTIVE_FACTOR * self.parameters.status_period_s,
+            false => self.parameters.status_period_s,
+        }
     }
 
     fn after(&self, period_s: f64) -> Instant {

@@ -33,7 +33,8 @@ pub struct SimWorkcellParameters {
     pub real_time_factor: f64,
     /// Joint states and clock messages per simulated second.
     pub joint_states_rate_hz: f64,
-    /// Wall seconds between repeats of joint and pin states and clock while nothing moves.
+    /// Wall seconds between repeats of joint and pin states and clock while nothing moves; five times as many
+    /// when no command has come for a second.
     pub status_period_s: f64,
     /// Wall seconds between repeats of the camera frames while nothing moves.
     pub frames_period_s: f64,
@@ -55,7 +56,7 @@ impl Default for SimWorkcellParameters {
             real_time_factor: 0.0,
             joint_states_rate_hz: 50.0,
             status_period_s: 0.02,
-            frames_period_s: 0.5,
+            frames_period_s: 1.0,
         }
     }
 }

@@ -4,16 +4,22 @@
 //! - Services: `served/PACKAGE/NAME` says on `asked/..` what it was asked and answers what came on `reply/..`; what comes on
 //!   `ask/..` is asked of `answer/..`, and its answer goes out on `answered/..`. The same for our action, with `feedback/..` and
 //!   `result/..`.
+//! - `held/sctn_msgs/ExecutePickPlace` takes as many goals at once as come; each lasts as many tenths of a second as the step of
+//!   its proposal says, or until it is cancelled.
 
 use std::{
     process::ExitCode,
     sync::{Arc, Mutex, PoisonError},
+    time::Duration,
 };
 
 use msgs::{
     Action, CdrError, Interface, Service, Visitor, from_cdr,
     rcl_interfaces::{GetParameters, SetParameters},
-    sctn_msgs::{CaptureGoal, ExecutePickPlace, LoadDemonstration, ResetCell, Reward, SetStep},
+    sctn_msgs::{
+        CaptureGoal, ExecutePickPlace, ExecutePickPlaceFeedback, ExecutePickPlaceResult,
+        LoadDemonstration, ResetCell, Reward, SetStep,
+    },
     to_cdr,
 };
 use node_kit::{
@@ -52,6 +58,7 @@ impl Active for Echo {
         service::<SetStep>(node)?;
         carry_out::<ExecutePickPlace>(node)?;
         send::<ExecutePickPlace>(node)?;
+        hold(node)?;
         echo_latched(node)?;
         node.deactivated().await;
         Ok(())
@@ -212,6 +219,32 @@ fn carry_out<A: Action + 'static>(node: &Node) -> Result<(), NodeError> {
             let (_, running) = goal.accept();
             running.feedback(feedback.newest());
             running.succeed(result.newest());
+        }
+    });
+    Ok(())
+}
+
+/// Goals side by side, each as long as it says.
+fn hold(node: &Node) -> Result<(), NodeError> {
+    let mut server = node.action_server::<ExecutePickPlace>("held/sctn_msgs/ExecutePickPlace")?;
+    let keeper = node.clone();
+    node.spawn(async move {
+        loop {
+            let (goal, running) = server.recv().await.accept();
+            let id = goal.proposal.id;
+            keeper.spawn(async move {
+                running.feedback(ExecutePickPlaceFeedback {
+                    proposal_id: id,
+                    ..Default::default()
+                });
+                let mut result = ExecutePickPlaceResult::default();
+                result.result.proposal_id = id;
+                let lasting = Duration::from_millis(100) * goal.proposal.step;
+                tokio::select! {
+                    () = tokio::time::sleep(lasting) => running.succeed(result),
+                    () = running.cancel_requested() => running.cancelled(result),
+                }
+            });
         }
     });
     Ok(())

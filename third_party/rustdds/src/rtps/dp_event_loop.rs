@@ -1,7 +1,7 @@
 use std::{
   cell::RefCell,
   collections::{BTreeMap, BTreeSet, HashMap, VecDeque},
-  net::IpAddr,
+  net::{IpAddr, Ipv4Addr},
   rc::Rc,
   sync::{Arc, RwLock},
   time::{Duration, Instant},
@@ -219,7 +219,14 @@ impl DPEventLoop {
     #[cfg(not(feature = "security"))]
     let security_plugins_opt = security_plugins_opt.and(None); // make sure it is None an consume value
 
-    let interface_observations = Rc::new(RefCell::new(InterfaceObservations::new()));
+    // We are on our own host: what is sent to our own readers goes over loopback.
+    let mut observations = InterfaceObservations::new();
+    observations.record(
+      participant_guid_prefix,
+      None,
+      (Ipv4Addr::LOCALHOST, 0).into(),
+    );
+    let interface_observations = Rc::new(RefCell::new(observations));
     let local_interfaces: Rc<[IfAddr]> = Rc::from(local_interface_table());
 
     Ok(Self {
@@ -772,6 +779,8 @@ impl DPEventLoop {
     // proxy's loopback unicast is split into the observation-gated bucket, so its
     // route falls back to multicast). Reflection in the DiscoveryDB (recognizing
     // our own announcements) is kept; only self send-matching is skipped.
+    let myself = participant_guid_prefix == self.domain_info.domain_participant_guid.prefix;
+    let readers_init_list = if myself { vec![] } else { readers_init_list };
 
     // Update local writers, i.e. reader_proxies inside them
     for (writer_eid, reader_eid, reader_endpoint_set_elem, reader_qos) in &readers_init_list {

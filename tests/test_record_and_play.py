@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import pathlib
@@ -111,6 +112,35 @@ def test_a_recording_is_split_by_size_and_the_files_are_one_bag(start, operator:
     # A file may be larger by the chunk that is open, here 1 MB.
     assert max(sizes) < 2_500_000
     assert [int(text.data.split()[0]) for _, text in contents(bag)] == list(range(40))
+
+
+def test_what_the_transport_has_lost_is_counted(start, operator: Operator, tmp_path: pathlib.Path) -> None:
+    bag = tmp_path / "bag"
+    recorder = start("sctn", "bag", "record", "/big", "--out", bag, "--compression", "none", "--json")
+    big = operator.node.create_publisher(String, "/big", STREAM)
+    wait_for_recorder(operator, big)
+    numbers = iter(range(1000))
+
+    def say(count: int, seconds: float) -> None:
+        for number in itertools.islice(numbers, count):
+            big.publish(String(data=f"{number} " + "x" * 100_000))
+            operator.spin(seconds)
+
+    say(5, 0.05)
+    # 60 MB, best effort, for a process that reads nothing: more than any receive buffer holds.
+    recorder.signal(signal.SIGSTOP)
+    say(600, 0.001)
+    recorder.signal(signal.SIGCONT)
+    operator.spin(1.0)
+    say(5, 0.05)
+    operator.spin(0.5)
+    report = end(recorder)
+    recorded = [int(text.data.split()[0]) for _, text in contents(bag)]
+    assert recorded[:5] == list(range(5)) and recorded[-5:] == list(range(605, 610))
+    lost = 610 - len(recorded)
+    assert 0 < lost
+    assert report["topics"]["/big"] == {"messages": len(recorded), "lost_in_transport": lost, "lost_in_queue": 0}
+    assert "/big" in recorder.errors() and f"{lost} messages lost in the transport" in recorder.errors()
 
 
 def test_what_finds_no_room_in_the_queue_is_counted_and_a_step_result_always_finds_some(

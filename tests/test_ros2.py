@@ -615,6 +615,17 @@ def test_a_signal_ends_a_node_cleanly(start, peer: Peer, number: signal.Signals)
     )
 
 
+def test_a_node_that_was_stopped_and_goes_on_answers_again(start, peer: Peer) -> None:
+    process = start("camera_fusion", "--ros-args", "-r", "__ns:=/stopped")
+    life = Life(peer, "/stopped/camera_fusion")
+    peer.until(lambda: life.state() == "active", "active node")
+    for _ in range(5):
+        process.signal(signal.SIGSTOP)
+        time.sleep(0.2)
+        process.signal(signal.SIGCONT)
+        assert life.state() == "active"
+
+
 def test_parameter_files_reach_the_nodes_they_name(start, peer: Peer, tmp_path: pathlib.Path) -> None:
     file = tmp_path / "parameters.yaml"
     file.write_text(

@@ -25,9 +25,9 @@ use crate::clock::Clock;
 /// The span of each node, with its full name as field `node`.
 const SPAN: &str = "node";
 
-/// RustDDS logs an error for every endpoint of a node that ends, which is none; what fails for
-/// good comes back to us as an error anyway. RUST_LOG=rustdds=warn shows all.
-const DEFAULT_FILTER: &str = "info,rustdds=off,ros2_client=error";
+/// RustDDS logs an error for every endpoint of a node that ends, which is none: of its errors only those of
+/// its two threads are said, without which a node would be deaf. RUST_LOG=rustdds=warn shows all.
+const DEFAULT_FILTER: &str = "info,rustdds=off,rustdds::rtps::dp_event_loop=error,rustdds::discovery=error,ros2_client=error";
 
 /// What writes to `/rosout` for each node of this process.
 static WRITERS: RwLock<BTreeMap<String, RosoutWriter>> = RwLock::new(BTreeMap::new());

@@ -169,13 +169,9 @@ def test_three_goals_run_side_by_side_one_is_cancelled_and_a_late_request_gets_i
     assert client.wait_for_server(20.0)
     said: list[int] = []
 
-    def goal(number: int, tenths_s: int) -> ExecutePickPlace.Goal:
-        return ExecutePickPlace.Goal(proposal=PickPlace(id=number, step=tenths_s))
-
     def send(number: int, tenths_s: int) -> Any:
-        return client.send_goal_async(
-            goal(number, tenths_s), feedback_callback=lambda message: said.append(message.feedback.proposal_id)
-        )
+        goal = ExecutePickPlace.Goal(proposal=PickPlace(id=number, step=tenths_s))
+        return client.send_goal_async(goal, feedback_callback=lambda message: said.append(message.feedback.proposal_id))
 
     sending = [send(1, 600), send(2, 20), send(3, 600)]
     first, second, third = (peer.wait(sent, "answer to a goal") for sent in sending)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import re
 import time
 from collections.abc import Callable
 from typing import Any, TypeVar
 
 import rclpy
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
@@ -47,6 +49,8 @@ class Operator:
         # How many nodes have to hear a confirmation; more where the whole graph runs.
         self.listeners = 1
         self.received: dict[str, list[Any]] = {topic: [] for topic in TOPICS}
+        # What each node says of itself, by name.
+        self.states: dict[str, DiagnosticStatus] = {}
         self._context = rclpy.Context()
         self._context.init(domain_id=domain)
         self.node = rclpy.create_node(name, context=self._context)
@@ -54,6 +58,9 @@ class Operator:
         self._executor.add_node(self.node)
         for topic, (message_type, qos) in TOPICS.items():
             self.node.create_subscription(message_type, topic, self.received[topic].append, qos)
+        self.node.create_subscription(
+            DiagnosticArray, "/diagnostics", lambda said: self.states.update({one.name: one for one in said.status}), EVENT
+        )
         self._confirmations = self.node.create_publisher(StepConfirmation, "step_confirmation", EVENT)
 
     def __enter__(self) -> Operator:
@@ -81,7 +88,7 @@ class Operator:
         return found
 
     def next(
-        self, topic: str, after: int = 0, accept: Callable[[Any], bool] = lambda _: True, timeout_s: float = 60.0
+        self, topic: str, after: int = 0, accept: Callable[[Any], bool] = lambda _: True, timeout_s: float = 120.0
     ) -> Any:
         """The first message of a topic, from the `after`th on, that is accepted."""
         messages = self.received[topic]
@@ -96,6 +103,20 @@ class Operator:
     def newest(self, topic: str) -> Any:
         """The newest message of a topic."""
         return self.received[topic][-1]
+
+    def diagnosed(self, state: str) -> dict[str, str]:
+        """The values of a state in the diagnostics, such as `goal_oracle: topics`."""
+        said = self.states.get(f"/{state}")
+        return {value.key: value.value for value in said.values} if said else {}
+
+    def has_heard(self, node: str, topic: str) -> bool:
+        """Whether a message has reached a node, by its diagnostics."""
+        return re.match("in messages=[1-9]", self.diagnosed(f"{node}: topics").get(topic, "")) is not None
+
+    def executor_is_ready(self) -> bool:
+        """Whether the executor hears the driver, and would move."""
+        driver = self.states.get("/suction_executor: driver")
+        return driver is not None and driver.message == "ready"
 
     def confirm(self, proposal_id: int, decision: int) -> None:
         """Says one word on a proposal."""
@@ -116,7 +137,7 @@ class Operator:
         self.until(
             lambda: self._confirmations.get_subscription_count() >= self.listeners,
             "subscription to step_confirmation",
-            timeout_s=30.0,
+            timeout_s=60.0,
         )
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pathlib
 
+from rclpy.duration import Duration
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
@@ -45,7 +46,13 @@ def contents(bag: pathlib.Path, *topics: str) -> list[tuple[str, object]]:
 
 def wait_for_recorder(operator: Operator, *publishers) -> None:
     """Until each of them has a subscription."""
-    operator.until(lambda: all(p.get_subscription_count() >= 1 for p in publishers), "recorder that listens", 30.0)
+    operator.until(lambda: all(p.get_subscription_count() >= 1 for p in publishers), "recorder that listens", 60.0)
+
+
+def wait_until_heard(*publishers) -> None:
+    """Until the recorder has everything: what it has when it ends is in the bag."""
+    for publisher in publishers:
+        assert publisher.wait_for_all_acked(Duration(seconds=60)), f"{publisher.topic_name} was not acknowledged"
 
 
 def same(ours: object, theirs: object) -> bool:

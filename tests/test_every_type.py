@@ -7,7 +7,6 @@ import pathlib
 import random
 import signal
 import string
-import time
 
 import numpy as np
 import pytest
@@ -138,8 +137,7 @@ def test_every_type_is_played_and_recorded_with_our_own_definitions(
     copy = tmp_path / "copy"
     recorder = start("sctn", "bag", "record", "--regex", "^/every/", "--out", copy, "--compression", compression)
     play = start("sctn", "bag", "play", bag, "--wait", 60)
-    assert play.wait(90.0) == 0, play.log()
-    time.sleep(1.0)
+    assert play.wait(120.0) == 0, play.log()
     recorder.signal(signal.SIGINT)
     assert recorder.wait(30.0) == 0, recorder.log()
     assert "definition" not in recorder.errors(), recorder.errors()

@@ -18,11 +18,15 @@ use std::sync::atomic::{AtomicBool, AtomicU64, AtomicUsize, Ordering::Relaxed};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError, mpsc};
 use std::thread::JoinHandle;
 use std::time::{Duration, Instant, SystemTime, UNIX_EPOCH};
+use tokio::sync::watch;
+use tokio::time::timeout_at;
 
 /// How often discovery is asked for new topics.
 const LOOK_EVERY: Duration = Duration::from_millis(100);
 /// How often what has come is closed off, so that it survives the end of the process.
 const FLUSH_EVERY: Duration = Duration::from_secs(1);
+/// At the end, how long what has arrived may take to be read, should more go on arriving.
+const LAST_WORDS: Duration = Duration::from_secs(1);
 /// The moments after which a crash must lose nothing of a step.
 const FLUSHED_AT_ONCE: [&str; 3] = [
     StepConfirmation::TYPE_NAME,
@@ -203,7 +207,7 @@ struct Followed {
     type_name: String,
     index: usize,
     asked: RawQos,
-    task: tokio::task::AbortHandle,
+    task: tokio::task::JoinHandle<Option<()>>,
 }
 
 /// Subscribes to topics; one thread writes what arrives.
@@ -215,6 +219,8 @@ pub struct Recorder {
     queue: mpsc::Sender<Entry>,
     writer: JoinHandle<Result<Written>>,
     followed: BTreeMap<String, Followed>,
+    /// Goes when nothing more is to be listened to.
+    listening: watch::Sender<()>,
     /// Topics that cannot be recorded, warned about once.
     refused: BTreeSet<String>,
 }
@@ -254,6 +260,7 @@ impl Recorder {
             queue,
             writer,
             followed: BTreeMap::new(),
+            listening: watch::Sender::new(()),
             refused: BTreeSet::new(),
         })
     }
@@ -385,10 +392,15 @@ impl Recorder {
         let limit = self.options.queue_bytes;
         let flush = FLUSHED_AT_ONCE.contains(&type_name);
         let clock = self.options.use_sim_time.then(|| self.node.clock().clone());
+        let mut listening = self.listening.subscribe();
         let task = self.node.spawn(async move {
             let mut sequence = shared.heard()[index].count.sequence();
             loop {
-                let message = subscription.recv().await;
+                let message = tokio::select! {
+                    biased;
+                    message = subscription.recv() => message,
+                    _ = listening.changed() => return,
+                };
                 let now = match &clock {
                     Some(clock) => Duration::from_nanos(clock.now_ns().max(0) as u64),
                     None => SystemTime::now()
@@ -437,7 +449,7 @@ impl Recorder {
             type_name: type_name.to_owned(),
             index,
             asked,
-            task: task.abort_handle(),
+            task,
         };
         self.followed.insert(topic.to_owned(), followed);
         Ok(())
@@ -457,7 +469,7 @@ impl Recorder {
         progress
     }
 
-    /// Stops listening, writes what has come, and gives the bag its name.
+    /// Stops listening, writes what has arrived until now, and gives the bag its name.
     pub async fn finish(self) -> Result<Recording> {
         let Self {
             path,
@@ -465,10 +477,15 @@ impl Recorder {
             queue,
             writer,
             followed,
+            listening,
             ..
         } = self;
-        for topic in followed.values() {
-            topic.task.abort();
+        drop(listening);
+        let deadline = Instant::now() + LAST_WORDS;
+        for mut topic in followed.into_values() {
+            if timeout_at(deadline.into(), &mut topic.task).await.is_err() {
+                topic.task.abort();
+            }
         }
         // The thread ends when all senders are gone: those of the tasks go with them.
         drop(queue);

@@ -78,6 +78,10 @@ pub struct Proposer {
     newest: Option<Observation>,
     rejected: Vec<Isometry2<f64>>,
     progress: Progress,
+    /// The last proposal for this goal.
+    said: Option<u64>,
+    /// The end of the last motion: observations from before it are no ground for another.
+    moved_until: Duration,
     /// The operator has rejected somebody else's proposal for this goal.
     rejected_another: bool,
     /// The network works on an answer that nobody needs any more.
@@ -93,6 +97,8 @@ impl Proposer {
             newest: None,
             rejected: Vec::new(),
             progress: Progress::Waiting,
+            said: None,
+            moved_until: Duration::ZERO,
             rejected_another: false,
             outdated: false,
         }
@@ -161,8 +167,10 @@ impl Proposer {
             }
             if wanted.stamp < before.stamp {
                 self.newest = None;
+                self.moved_until = Duration::ZERO;
             }
         }
+        self.said = None;
         self.rejected_another = false;
         self.outdated |= matches!(self.progress, Progress::Deciding(_));
         self.goal = Some(wanted);
@@ -196,20 +204,26 @@ impl Proposer {
     /// The executor has reported: after a motion nothing more is proposed for this goal, after a refusal
     /// of the approval the proposal is open again.
     pub fn result(&mut self, result: &StepResult) -> Option<Job> {
-        let (Progress::Proposed(observation, id, pick) | Progress::Approved(observation, id, pick)) =
-            &self.progress
-        else {
-            return None;
-        };
-        if *id != result.proposal_id {
-            return None;
+        if result.duration != Default::default()
+            && let Ok(end) = convert::time_from_msg(&result.header.stamp)
+        {
+            self.moved_until = end;
         }
-        self.progress = match result.outcome {
-            StepResult::REFUSED => Progress::Proposed(observation.clone(), *id, *pick),
-            // A goal that says so follows.
-            StepResult::REJECTED => return None,
-            _ => Progress::Moved,
-        };
+        if self.said == Some(result.proposal_id) {
+            self.progress = match (result.outcome, &self.progress) {
+                // A goal that says so follows.
+                (StepResult::REJECTED, _) => return None,
+                (StepResult::REFUSED, Progress::Approved(observation, id, pick)) => {
+                    Progress::Proposed(observation.clone(), *id, *pick)
+                }
+                (StepResult::REFUSED, _) => return None,
+                // The heightmap after the motion may come before its result.
+                (_, progress) => {
+                    self.outdated |= matches!(progress, Progress::Deciding(_));
+                    Progress::Moved
+                }
+            };
+        }
         self.next()
     }
 
@@ -233,6 +247,7 @@ impl Proposer {
         let proposal = match decision {
             Ok(decision) => {
                 let proposal = propose(&observation, goal, decision);
+                self.said = Some(proposal.id);
                 self.progress = Progress::Proposed(observation, proposal.id, decision.pick);
                 Ok(proposal)
             }
@@ -255,7 +270,8 @@ impl Proposer {
         let due = match &self.progress {
             Progress::Waiting => true,
             Progress::Proposed(seen, ..) | Progress::Failed(seen) => {
-                self.change.changed(seen, newest)
+                let moved = seen.stamp < self.moved_until && newest.stamp >= self.moved_until;
+                moved || self.change.changed(seen, newest)
             }
             Progress::Deciding(_) | Progress::Approved(..) | Progress::Moved => false,
         };
@@ -488,6 +504,30 @@ mod tests {
             None
         );
         assert!(proposer.wanted(goal(2, 0, 7)).unwrap().is_some());
+    }
+
+    /// Where proposals are carried out without an approval.
+    #[test]
+    fn the_heightmap_after_a_motion_that_comes_before_its_result_makes_no_proposal() {
+        let (mut proposer, proposal) = proposed();
+        assert!(proposer.observed(heightmap(6, 0.1)).unwrap().is_some());
+        let moved = result(proposal.id, StepResult::PLACED);
+        assert_eq!(proposer.result(&moved), None);
+        assert_eq!(proposer.decided(Ok(&decision(0.6))), (None, None));
+        assert!(proposer.wanted(goal(2, 0, 6)).unwrap().is_some());
+    }
+
+    #[test]
+    fn after_the_motion_of_another_proposal_ours_is_made_anew() {
+        let (mut proposer, proposal) = proposed();
+        let mut moved = result(proposal.id ^ 1, StepResult::GRASP_FAILED);
+        moved.header.stamp.sec = 7;
+        moved.duration.sec = 2;
+        assert_eq!(proposer.result(&moved), None);
+        assert_eq!(proposer.observed(heightmap(6, 0.0)).unwrap(), None);
+        assert!(proposer.observed(heightmap(7, 0.0)).unwrap().is_some());
+        proposer.decided(Ok(&decision(0.4)));
+        assert_eq!(proposer.observed(heightmap(8, 0.0)).unwrap(), None);
     }
 
     #[test]

@@ -9,12 +9,12 @@ use std::{
         atomic::{AtomicBool, Ordering},
     },
     thread,
-    time::Duration,
+    time::{Duration, Instant},
 };
 
 use futures::StreamExt as _;
 use ros2_client::{
-    RmwRequestId,
+    Gid, RmwRequestId,
     action::{
         CancelGoalRequest, GetResultRequest, GetResultResponse, GoalStatusEnum, SendGoalRequest,
         SendGoalResponse,
@@ -35,7 +35,7 @@ use msgs::Action;
 use crate::{
     clock::Clock,
     graph::Graph,
-    service::{CallError, CallOptions, attempt},
+    service::{CallError, CallOptions, HEARING, attempt},
     statistics::Statistics,
 };
 
@@ -58,6 +58,9 @@ type RosClient<A> =
 /// Cancel requests, result requests and repeated goal requests are answered in the background.
 pub struct ActionServer<A: Action + 'static> {
     goals: mpsc::Receiver<NewGoal<A>>,
+    graph: Graph,
+    /// A goal whose client may not hear its feedback yet, and since when.
+    waiting: Option<(NewGoal<A>, Instant)>,
     shared: Arc<Shared<A>>,
     waker: mio1::Waker,
 }
@@ -106,6 +109,7 @@ impl<A: Action + 'static> ActionServer<A> {
     pub(crate) fn new(
         mut server: RosServer<A>,
         clock: Clock,
+        graph: Graph,
         statistics: Arc<Statistics>,
     ) -> io::Result<Self> {
         // The low-level server can be waited for with mio only.
@@ -136,17 +140,33 @@ impl<A: Action + 'static> ActionServer<A> {
             .spawn(move || span.in_scope(|| receiving.receive(poll, sender)))?;
         Ok(Self {
             goals,
+            graph,
+            waiting: None,
             shared,
             waker,
         })
     }
 
     /// The next goal, to be accepted or rejected. Can be cancelled without losing a goal.
+    ///
+    /// A client's first goal may come before its reader of feedback is discovered, and what is sent to nobody is lost.
     pub async fn recv(&mut self) -> NewGoal<A> {
-        match self.goals.recv().await {
-            Some(goal) => goal,
-            // The receiving thread has gone, which only happens on shutdown.
-            None => std::future::pending().await,
+        loop {
+            if let Some((goal, since)) = &self.waiting {
+                let topic = format!("rt{}/_action/feedback", self.shared.statistics.name);
+                let limit = HEARING.saturating_sub(since.elapsed());
+                self.graph
+                    .wait_for_feedback_to(goal.client, &topic, limit)
+                    .await;
+            }
+            if let Some((goal, _)) = self.waiting.take() {
+                return goal;
+            }
+            match self.goals.recv().await {
+                Some(goal) => self.waiting = Some((goal, Instant::now())),
+                // The receiving thread has gone, which only happens on shutdown.
+                None => std::future::pending().await,
+            }
         }
     }
 
@@ -238,6 +258,7 @@ impl<A: Action + 'static> Shared<A> {
         drop(table);
         permit.send(NewGoal {
             goal: request.goal,
+            client: request_id.writer_gid,
             handle: Unanswered {
                 id,
                 shared: Some(Arc::clone(self)),
@@ -416,6 +437,7 @@ impl<A: Action + 'static> Table<A> {
 pub struct NewGoal<A: Action + 'static> {
     /// What is asked for; unchecked.
     pub goal: A::Goal,
+    client: Gid,
     handle: Unanswered<A>,
 }
 

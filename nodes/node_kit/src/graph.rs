@@ -92,6 +92,28 @@ impl Graph {
         dds_topic: &str,
         limit: Duration,
     ) -> bool {
+        let one = GUID::from(client).entity_id.entity_kind.is_reader();
+        self.wait_for_reader(client, one, dds_topic, limit).await
+    }
+
+    /// The same for what goes to all clients of an action.
+    pub(crate) async fn wait_for_feedback_to(
+        &self,
+        client: Gid,
+        dds_topic: &str,
+        limit: Duration,
+    ) -> bool {
+        self.wait_for_reader(client, false, dds_topic, limit).await
+    }
+
+    /// `one`: it is this very reader, not any of its participant.
+    async fn wait_for_reader(
+        &self,
+        client: Gid,
+        one: bool,
+        dds_topic: &str,
+        limit: Duration,
+    ) -> bool {
         let client = GUID::from(client);
         if client.prefix == self.participant.guid().prefix {
             return true;
@@ -99,7 +121,7 @@ impl Graph {
         let heard = || {
             self.participant.discovered_readers().iter().any(|reader| {
                 let guid = reader.reader_proxy.remote_reader_guid;
-                let same = match client.entity_id.entity_kind.is_reader() {
+                let same = match one {
                     true => guid == client,
                     false => guid.prefix == client.prefix,
                 };

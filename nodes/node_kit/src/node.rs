@@ -503,7 +503,9 @@ impl Node {
             .map_err(|error| NodeError::middleware("action", &full, error))?;
         let statistics = self.statistics(Statistics::new(&full, Direction::In));
         self.span()
-            .in_scope(|| ActionServer::new(server, self.inner.clock.clone(), statistics))
+            .in_scope(|| {
+                ActionServer::new(server, self.inner.clock.clone(), self.graph(), statistics)
+            })
             .map_err(|error: io::Error| NodeError::middleware("action", &full, error))
     }
 

@@ -146,7 +146,7 @@ impl<S: Service> ServiceClient<S> {
 }
 
 /// How long a request waits for its client to be able to hear the answer.
-const HEARING: Duration = Duration::from_millis(500);
+pub(crate) const HEARING: Duration = Duration::from_millis(500);
 /// Clients that are remembered as able to.
 const MAX_CLIENTS: usize = 1024;
 

@@ -62,7 +62,7 @@ class Cameras:
         self._operator.until(
             lambda: all(publisher.get_subscription_count() for publisher in [*publishers, self._transforms]),
             "node that listens to the cameras",
-            30.0,
+            60.0,
         )
 
     def publish_extrinsics(self, names: tuple[str, ...] = NAMES) -> None:

@@ -14,6 +14,7 @@ from typing import Any, TypeVar
 import numpy as np
 import rclpy
 from rclpy.executors import SingleThreadedExecutor
+from rclpy.impl.implementation_singleton import rclpy_implementation as _rclpy
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 
 from processes import REPOSITORY
@@ -40,7 +41,11 @@ class Peer:
 
     def _spin(self) -> None:
         while not self._ending:
-            self._executor.spin_once(timeout_sec=0.05)
+            try:
+                self._executor.spin_once(timeout_sec=0.05)
+            except (_rclpy.InvalidHandle, _rclpy.RCLError):
+                # The other thread has just destroyed what was to be waited for; next time it is not.
+                pass
 
     def __enter__(self) -> Peer:
         return self
@@ -52,10 +57,11 @@ class Peer:
         self.node.destroy_node()
         self._context.try_shutdown()
 
-    def until(self, condition: Callable[[], Found], what: str, timeout_s: float = 20.0) -> Found:
+    def until(self, condition: Callable[[], Found], what: str, timeout_s: float = 60.0) -> Found:
         """Waits until `condition` returns something true, and returns that."""
         end = time.monotonic() + timeout_s
         while not (found := condition()):
+            assert self._thread.is_alive(), "an exception has ended the thread that spins"
             if time.monotonic() > end:
                 raise TimeoutError(f"no {what} within {timeout_s} s")
             time.sleep(0.02)
@@ -76,15 +82,15 @@ class Peer:
     def client(self, kind: type, name: str) -> Any:
         """A service client whose server is there."""
         client = self.node.create_client(kind, name)
-        assert client.wait_for_service(20.0), f"no service {name}"
+        assert client.wait_for_service(60.0), f"no service {name}"
         return client
 
-    def wait(self, future: Any, what: str, timeout_s: float = 20.0) -> Any:
+    def wait(self, future: Any, what: str, timeout_s: float = 60.0) -> Any:
         """The result of a future."""
         self.until(future.done, what, timeout_s)
         return future.result()
 
-    def call(self, kind: type, name: str, request: Any = None, timeout_s: float = 20.0) -> Any:
+    def call(self, kind: type, name: str, request: Any = None, timeout_s: float = 60.0) -> Any:
         """Calls a service once."""
         client = self.client(kind, name)
         try:

@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 import pytest
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from diagnostic_msgs.msg import DiagnosticStatus
 from sctn_msgs.msg import Heightmap
 from sensor_msgs.msg import CompressedImage, Image, PointCloud2
 
@@ -25,7 +25,7 @@ from cameras import (
     image,
     set_depth,
 )
-from cell_operator import EVENT, LATCHED, Operator
+from cell_operator import LATCHED, Operator, nanoseconds
 from processes import Process, free_domain
 
 # Heights come from depths in f32 or whole millimetres.
@@ -57,7 +57,7 @@ def fused(
         operator.spin(0.3)
         return next((made for made in reversed(operator.received["heightmap"]) if made.header.stamp in stamps), None)
 
-    return operator.until(heightmap, "heightmap of these views", 20.0)
+    return operator.until(heightmap, "heightmap of these views", 60.0)
 
 
 def heights(heightmap: Heightmap) -> np.ndarray:
@@ -232,7 +232,7 @@ def test_a_bad_view_is_named_and_the_node_lives_on(cameras, operator_for_module,
         log = fusion.errors()[before:]
         return all(word in log for word in said)
 
-    operator_for_module.until(complaint, f"complaint that names {said} in the log of camera_fusion", 10.0)
+    operator_for_module.until(complaint, f"complaint that names {said} in the log of camera_fusion", 60.0)
     assert fusion.exit_code is None
     assert heights(fused(operator_for_module, cameras)).max() == pytest.approx(BOX_HEIGHT_M, abs=TOLERANCE_M)
 
@@ -241,15 +241,17 @@ def test_a_missing_camera_is_named_and_no_heightmap_of_two_views_passes_as_one_o
     cameras, operator_for_module, fusion
 ) -> None:
     before = len(fusion.errors())
-    heightmaps = operator_for_module.count("heightmap")
+    stamps = []
 
     def complaint() -> bool:
-        cameras.publish(leave_out="right")
+        stamps.append(nanoseconds(cameras.publish(leave_out="right")))
         operator_for_module.spin(0.3)
         return "right" in fusion.errors()[before:]
 
-    operator_for_module.until(complaint, "complaint that names the camera right", 15.0)
-    assert all(made.views < 3 for made in operator_for_module.received["heightmap"][heightmaps:])
+    operator_for_module.until(complaint, "complaint that names the camera right", 60.0)
+    # One of the views before may come late.
+    made = [made for made in operator_for_module.received["heightmap"] if nanoseconds(made.header.stamp) >= stamps[0]]
+    assert all(heightmap.views < 3 for heightmap in made)
     assert fused(operator_for_module, cameras).views == 3
 
 
@@ -266,7 +268,7 @@ def test_without_extrinsics_nothing_is_fused_and_the_camera_is_named(start) -> N
             operator.spin(0.3)
             return "right_color_optical_frame" in fusion.errors()
 
-        operator.until(complaint, "complaint about the frame without extrinsics", 15.0)
+        operator.until(complaint, "complaint about the frame without extrinsics", 60.0)
         assert fusion.exit_code is None
         assert all(made.views < 3 for made in operator.received["heightmap"])
         cameras.publish_extrinsics()
@@ -277,13 +279,9 @@ def test_a_camera_that_stops_and_comes_back_is_in_the_diagnostics_and_others_go_
     other = free_domain()
     start("camera_fusion", "--ros-args", "-p", "fuse_without_silent:=true", "-p", "camera_timeout_s:=1.0", domain=other)
     with Operator(other) as operator:
-        states: dict[str, DiagnosticStatus] = {}
-        operator.node.create_subscription(
-            DiagnosticArray, "/diagnostics", lambda said: states.update({one.name: one for one in said.status}), EVENT
-        )
 
         def said(level: bytes, words: str) -> bool:
-            state = states.get("/camera_fusion: camera right")
+            state = operator.states.get("/camera_fusion: camera right")
             return state is not None and state.level == level and words in state.message
 
         cameras = Cameras(operator)
@@ -296,18 +294,18 @@ def test_a_camera_that_stops_and_comes_back_is_in_the_diagnostics_and_others_go_
             operator.spin(0.2)
             return operator.newest("heightmap").views == views
 
-        operator.until(lambda: without_right(2), "heightmap of two views", 20.0)
-        operator.until(lambda: without_right(2) and said(DiagnosticStatus.ERROR, "no colour and depth image"), "error", 10.0)
-        operator.until(lambda: without_right(3), "heightmap of three views", 20.0)
-        operator.until(lambda: without_right(3) and said(DiagnosticStatus.OK, "images arrive"), "recovery", 10.0)
+        operator.until(lambda: without_right(2), "heightmap of two views", 60.0)
+        operator.until(lambda: without_right(2) and said(DiagnosticStatus.ERROR, "no colour and depth image"), "error", 60.0)
+        operator.until(lambda: without_right(3), "heightmap of three views", 60.0)
+        operator.until(lambda: without_right(3) and said(DiagnosticStatus.OK, "images arrive"), "recovery", 60.0)
 
-        def values(state: str) -> dict[str, str]:
-            return {value.key: value.value for value in states[f"/camera_fusion: {state}"].values}
+        def used() -> bool:
+            fusion, right = (operator.diagnosed(f"camera_fusion: {state}") for state in ("fusion", "camera right"))
+            return fusion["views"] == "3" and right["last_used_color_stamp_s"] == fusion["stamp_s"]
 
         # What was used, said once a second.
-        operator.until(lambda: values("fusion")["views"] == "3", "report of three views", 10.0)
-        assert float(values("fusion")["coverage"]) > 0.5
-        assert float(values("camera right")["last_used_color_stamp_s"]) == float(values("fusion")["stamp_s"])
+        operator.until(lambda: without_right(3) and used(), "report of three views", 60.0)
+        assert float(operator.diagnosed("camera_fusion: fusion")["coverage"]) > 0.5
 
 
 def test_a_calibration_file_says_where_the_cameras_are_without_tf(start, tmp_path) -> None:
@@ -323,7 +321,7 @@ def test_a_calibration_file_says_where_the_cameras_are_without_tf(start, tmp_pat
     for spoiled, word in [(pose.replace("0.0, 0.0]}", "0.0, 0.5]}"), "left"), (pose.replace("translation_m", "place"), "place")]:
         file.write_text(f"cameras:\n  left: {spoiled}\n")
         refused = start("camera_fusion", "--ros-args", "-p", f"calibration:={file}", domain=other)
-        assert refused.wait(10.0) != 0
+        assert refused.wait(60.0) != 0
         assert "cell.yaml" in refused.errors()
         assert word in refused.errors()
 
@@ -335,12 +333,18 @@ def test_every_view_of_the_heightmap_comes_to_who_listens(start) -> None:
         cameras = Cameras(operator)
         cameras.wait_for_fusion()
         cameras.publish_extrinsics()
-        heightmap = fused(operator, cameras)
+        fused(operator, cameras)
         # Who comes after the heightmap gets its views all the same.
         views: dict[str, object] = {}
         for kind, topic in [(PointCloud2, "heightmap/points"), (Image, "heightmap/image"), (CompressedImage, "heightmap/image/compressed")]:
             operator.node.create_subscription(kind, topic, functools.partial(views.__setitem__, topic), LATCHED)
-        operator.until(lambda: len(views) == 3, "views of the heightmap", 20.0)
+
+        def of_the_newest() -> bool:
+            stamp = operator.newest("heightmap").header.stamp
+            return len(views) == 3 and all(view.header.stamp == stamp for view in views.values())
+
+        operator.until(of_the_newest, "views of the newest heightmap", 60.0)
+        heightmap = operator.newest("heightmap")
         cloud = views["heightmap/points"]
         points = np.frombuffer(cloud.data.tobytes(), dtype=np.dtype("<f4")).reshape(320, 160, 4)
         assert np.array_equal(points[:, :, 2], heights(heightmap))
@@ -349,4 +353,3 @@ def test_every_view_of_the_heightmap_comes_to_who_listens(start) -> None:
         compressed = views["heightmap/image/compressed"]
         assert compressed.format == "png"
         assert compressed.data.tobytes().startswith(b"\x89PNG")
-        assert {view.header.stamp.sec for view in views.values()} == {heightmap.header.stamp.sec}

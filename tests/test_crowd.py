@@ -13,6 +13,8 @@ from peer import Peer
 SCRIPTS = 5
 NODES = 6
 ROUNDS = 8
+# Names come one by one; after so long there are no more.
+QUIET_S = 3.0
 
 
 def test_scripts_hear_nodes_that_start_together_whole(start: Callable, domain: int) -> None:
@@ -34,8 +36,12 @@ def test_scripts_hear_nodes_that_start_together_whole(start: Callable, domain: i
 def settled(peer: Peer, name: str) -> set[str]:
     """What a node has once it is active and nothing comes any more."""
     peer.until(lambda: "/heightmap" in ends(peer.node, name), f"node {name}")
-    time.sleep(1.0)
-    return ends(peer.node, name)
+    found, since = ends(peer.node, name), time.monotonic()
+    while time.monotonic() - since < QUIET_S:
+        time.sleep(0.05)
+        if (now := ends(peer.node, name)) != found:
+            found, since = now, time.monotonic()
+    return found
 
 
 def ends(node: Node, name: str) -> set[str]:

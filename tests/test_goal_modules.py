@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 
 import pytest
-from sctn_msgs.msg import StepConfirmation
+from sctn_msgs.msg import StepConfirmation, StepResult
 
 from cell_operator import Operator
 
@@ -19,7 +19,7 @@ def test_placing_is_completed_with_a_person_only_watching(start, operator: Opera
     # What was seen led to the last of the goals.
     goal = operator.next("goal", accept=lambda goal: goal.step == goal.step_count, timeout_s=200.0)
     assert goal.step == 9
-    assert launch.wait(60.0) == 0, launch.log()
+    assert launch.wait(120.0) == 0, launch.log()
     outcome = json.loads(launch.output().splitlines()[-1])
     assert outcome["completed"] is True and outcome["reward"] == pytest.approx(1.0), outcome
 
@@ -32,9 +32,14 @@ def test_a_stop_of_the_watcher_ends_the_motions(start, operator: Operator) -> No
     # Executor, oracle and policy.
     operator.listeners = 3
     operator.next("step_result")
+    before = operator.count("step_result")
     operator.confirm(0, StepConfirmation.STOP)
-    # Time for the motion under way.
-    operator.spin(2.5)
+    # The end of the motion under way, or the answer to the stop where there was none.
+    operator.next(
+        "step_result",
+        before,
+        lambda said: said.outcome == StepResult.STOPPED or said.proposal_id == 0 or said.reason.startswith("the stop came"),
+    )
     results = operator.count("step_result")
     operator.spin(2.5)
     assert operator.count("step_result") == results < 9

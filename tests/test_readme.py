@@ -7,6 +7,7 @@ import pathlib
 import re
 import subprocess
 import sys
+import time
 
 from processes import REPOSITORY, environment
 
@@ -21,7 +22,11 @@ def test_the_operator_script_of_the_readme_carries_a_run_through(start, domain: 
         )
         try:
             launch = start("sctn", "launch", "--problem", "placing", "--seed", 10004, "--operator", "none", "--processes")
-            assert launch.wait(100.0) == 0, f"{launch.log()}\n{log.read_text()}"
+            assert launch.wait(300.0) == 0, f"{launch.log()}\n{log.read_text()}"
+            # The script may hear of the last reward a little later.
+            deadline = time.monotonic() + 30.0
+            while not log.read_text().endswith("reward 1.00\n") and time.monotonic() < deadline:
+                time.sleep(0.1)
         finally:
             person.kill()
             person.wait()

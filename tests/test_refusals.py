@@ -18,7 +18,7 @@ from rclpy.publisher import Publisher
 from sctn_msgs.msg import Heightmap, PickPlace, PrimitiveSettings, StepConfirmation, StepResult
 from std_msgs.msg import Header
 
-from cell_operator import LATCHED, Operator
+from cell_operator import LATCHED, Operator, nanoseconds
 
 ROWS, COLS, PIXEL_SIZE_M = 320, 160, 0.003125
 SETTINGS = PrimitiveSettings(
@@ -44,7 +44,8 @@ class Cell:
         """Everybody knows everybody, and the arm has reported where it stands."""
         self.operator.until(
             # The operator subscribes to both itself.
-            lambda: min(self._heightmaps.get_subscription_count(), self._proposals.get_subscription_count()) >= 2,
+            lambda: min(self._heightmaps.get_subscription_count(), self._proposals.get_subscription_count()) >= 2
+            and self.operator.executor_is_ready(),
             "executor that listens",
             60.0,
         )
@@ -111,18 +112,29 @@ class Cell:
         assert travel < STILL_RAD, f"the arm moved by {travel} rad"
 
     def joints(self) -> np.ndarray:
-        """Joint positions in the order of the message [rad]."""
-        self.operator.spin(0.1)
-        return np.array(self.operator.newest("joint_states").position)
+        """Joint positions in the order of the message, no older than the executor's last word [rad]."""
+        return np.array(
+            self.operator.next(
+                "joint_states",
+                self.operator.count("joint_states"),
+                lambda state: nanoseconds(state.header.stamp) >= nanoseconds(self._last_word()),
+            ).position
+        )
+
+    def _last_word(self) -> Time:
+        said = self.operator.received["step_result"]
+        return said[-1].header.stamp if said else Time()
 
     @staticmethod
     def _publish(publisher: Publisher, message: Heightmap | PickPlace) -> None:
         """Returns when the executor has it: a lost packet is sent again."""
         publisher.publish(message)
-        assert publisher.wait_for_all_acked(Duration(seconds=20)), f"{publisher.topic_name} was not acknowledged"
+        assert publisher.wait_for_all_acked(Duration(seconds=60)), f"{publisher.topic_name} was not acknowledged"
 
     def _now(self) -> Time:
-        return self.operator.newest("clock").clock if self.operator.count("clock") else Time(sec=1)
+        # A clock may come later than what was said at its time.
+        clocks = [message.clock for message in self.operator.received["clock"][-1:]]
+        return max([*clocks, self._last_word()], key=nanoseconds)
 
 
 @pytest.fixture(scope="module")

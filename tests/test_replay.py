@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import json
 import pathlib
+import re
 import signal
 import time
+from collections.abc import Callable, Iterable
 
 from mcap.reader import make_reader
+from mcap.records import Channel, Message
 from mcap.stream_reader import StreamReader
 
 from processes import REPOSITORY, free_domain
@@ -36,23 +39,28 @@ def test_a_recorded_run_gives_the_same_heightmaps_goals_and_proposals_again(star
         "goal_oracle": ["-p", f"demonstration:={tmp_path / 'run/demonstration'}"],
         "gctn_policy": ["-p", f"checkpoint:={checkpoint}"],
     }
+    nodes = []
     for node, own in parameters.items():
         common = ["--ros-args", "--params-file", config / f"{node}.yaml", "-p", "use_sim_time:=true"]
-        start(node, *common, *own, domain=domain)
+        nodes.append(start(node, *common, *own, domain=domain))
     replay = tmp_path / "replay"
     record = start("sctn", "bag", "record", *COMPARED, "--out", replay, domain=domain)
-    # The oracle hears everything once it has said its first goal; others subscribe to the same topics.
-    wait_for_messages(bag=replay.with_name("replay.partial"), topic="/goal", count=1)
+    # Every node listens: others subscribe to the same topics.
+    wait_until(lambda: all(re.search(r"\bactive\b", node.errors()) for node in nodes), "active nodes")
+    unfinished = replay.with_name("replay.partial")
+    wait_until(lambda: flushed(unfinished)["/goal"], "goal")
     play = start(
         "sctn", "bag", "play", outcome["bag"], "--topics", *PLAYED, "--regex", CAMERAS, "--wait", 30, "--json",
         domain=domain,
     )  # fmt: skip
-    assert play.wait(120.0) == 0, play.log()
+    assert play.wait(240.0) == 0, play.log()
     assert json.loads(play.output().splitlines()[-1])["unsent"] == 0
-    # The last proposal may still be on its way.
-    wait_for_messages(bag=replay.with_name("replay.partial"), topic="/pick_place", count=outcome["steps"])
+    # The last of them may still be on their way.
+    wait_until(
+        lambda: all(len(found) >= len(recorded[topic]) for topic, found in flushed(unfinished).items()), "last messages"
+    )
     record.signal(signal.SIGTERM)
-    assert record.wait(30.0) == 0, record.log()
+    assert record.wait(60.0) == 0, record.log()
 
     replayed = messages(replay)
     assert len(recorded["/pick_place"]) == outcome["steps"]
@@ -63,39 +71,43 @@ def test_a_recorded_run_gives_the_same_heightmaps_goals_and_proposals_again(star
         assert replayed[topic][: len(recorded[topic])] == recorded[topic], f"{topic} differs"
 
 
-def messages(bag: pathlib.Path) -> dict[str, list[bytes]]:
+def distinct(messages: Iterable[tuple[str, bytes]]) -> dict[str, list[bytes]]:
     """The serialised messages of each compared topic, in order, without repetitions."""
     found: dict[str, list[bytes]] = {topic: [] for topic in COMPARED}
-    (file,) = bag.glob("*.mcap")
-    with file.open("rb") as stream:
-        for _, channel, message in make_reader(stream).iter_messages():
-            known = found.get(channel.topic)
-            if known is not None and message.data not in known[-1:]:
-                known.append(message.data)
+    for topic, data in messages:
+        known = found.get(topic)
+        if known is not None and data not in known[-1:]:
+            known.append(data)
     return found
 
 
-def wait_for_messages(bag: pathlib.Path, topic: str, count: int, timeout_s: float = 60.0) -> None:
-    """Until the unfinished bag holds that many messages of a topic, by what is flushed of it."""
-    end = time.monotonic() + timeout_s
-    found = 0
-    while time.monotonic() < end:
-        names: dict[int, str] = {}
-        found = 0
-        file = next(bag.glob("*.mcap"), None)
-        if file is None:
-            time.sleep(0.2)
-            continue
+def messages(bag: pathlib.Path) -> dict[str, list[bytes]]:
+    """Those of a bag."""
+    (file,) = bag.glob("*.mcap")
+    with file.open("rb") as stream:
+        return distinct((channel.topic, message.data) for _, channel, message in make_reader(stream).iter_messages())
+
+
+def flushed(bag: pathlib.Path) -> dict[str, list[bytes]]:
+    """Those of an unfinished bag, as far as they are on the disk."""
+    names: dict[int, str] = {}
+    found: list[tuple[str, bytes]] = []
+    for file in bag.glob("*.mcap"):
         with file.open("rb") as stream:
             try:
                 for record in StreamReader(stream).records:
-                    if type(record).__name__ == "Channel":
+                    if isinstance(record, Channel):
                         names[record.id] = record.topic
-                    elif type(record).__name__ == "Message":
-                        found += names[record.channel_id] == topic
+                    elif isinstance(record, Message):
+                        found.append((names[record.channel_id], record.data))
             except Exception:  # The open chunk at its end.
                 pass
-        if found >= count:
-            return
+    return distinct(found)
+
+
+def wait_until(condition: Callable[[], object], what: str, timeout_s: float = 120.0) -> None:
+    """Asks again and again."""
+    end = time.monotonic() + timeout_s
+    while not condition():
+        assert time.monotonic() < end, f"no {what} within {timeout_s} s"
         time.sleep(0.2)
-    raise TimeoutError(f"{found} of {count} messages on {topic}")

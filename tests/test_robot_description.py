@@ -35,7 +35,7 @@ def test_every_link_of_the_description_has_a_frame_that_leads_to_the_world(start
     node.create_subscription(String, "robot_description", lambda message: descriptions.append(message.data), LATCHED)
     node.create_subscription(TFMessage, "/tf", lambda message: tf(message, True), DYNAMIC)
     node.create_subscription(TFMessage, "/tf_static", lambda message: tf(message, False), LATCHED)
-    operator.until(lambda: descriptions and moving and "base_link" in parents, "description and frames", 30.0)
+    operator.until(lambda: descriptions and moving and "base_link" in parents, "description and frames", 60.0)
     robot = xml.etree.ElementTree.fromstring(descriptions[0])
     links = {link.get("name") for link in robot.findall("link")}
     assert links - {"world"} == set(parents)

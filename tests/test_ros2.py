@@ -35,7 +35,7 @@ from sctn_msgs.msg import Heightmap, PickPlace, Reward
 from sensor_msgs.msg import CameraInfo
 
 from peer import BEST_EFFORT, LATCHED, RELIABLE, Peer, filled, interfaces
-from processes import REPOSITORY, Process
+from processes import REPOSITORY, Process, free_domain
 
 ROUNDS = 3
 
@@ -55,7 +55,7 @@ def echo(start_for_module, peer: Peer) -> Process:
 
 
 def wait_for_node(peer: Peer, name: str, namespace: str = "/") -> None:
-    peer.until(lambda: (name, namespace) in peer.node.get_node_names_and_namespaces(), f"node {name}", 45.0)
+    peer.until(lambda: (name, namespace) in peer.node.get_node_names_and_namespaces(), f"node {name}")
 
 
 # --- messages, services, actions
@@ -116,7 +116,7 @@ def test_every_service_goes_both_ways_unchanged_also_repeated(echo: Process, pee
         for _ in range(ROUNDS):
             request, answer[0] = filled(kind.Request, chance), filled(kind.Response, chance)
             ask.publish(request)
-            peer.until(lambda answers=answers, answer=answer: answer[0] in answers, f"answer to {topic}", 30.0)
+            peer.until(lambda answers=answers, answer=answer: answer[0] in answers, f"answer to {topic}")
             assert request in heard
     assert "SetParameters" in names
 
@@ -128,7 +128,7 @@ def test_the_action_goes_both_ways_unchanged_with_feedback(echo: Process, peer: 
     asked = peer.listen(kind.Goal, f"asked/{topic}")
     feedback, result = peer.speak(kind.Feedback, f"feedback/{topic}"), peer.speak(kind.Result, f"result/{topic}")
     client = ActionClient(peer.node, kind, f"served/{topic}")
-    assert client.wait_for_server(20.0)
+    assert client.wait_for_server(60.0)
     for _ in range(ROUNDS):
         goal, said, end = filled(kind.Goal, chance), filled(kind.Feedback, chance), filled(kind.Result, chance)
         feedback.publish(said)
@@ -159,14 +159,14 @@ def test_the_action_goes_both_ways_unchanged_with_feedback(echo: Process, peer: 
     for _ in range(ROUNDS):
         goal, answer[0] = filled(kind.Goal, chance), filled(kind.Result, chance)
         ask.publish(goal)
-        peer.until(lambda: answer[0] in answers, "result of our goal", 30.0)
+        peer.until(lambda: answer[0] in answers, "result of our goal")
         assert goal in goals
     server.destroy()
 
 
 def test_three_goals_run_side_by_side_one_is_cancelled_and_a_late_request_gets_its_result(echo: Process, peer: Peer) -> None:
     client = ActionClient(peer.node, ExecutePickPlace, "held/sctn_msgs/ExecutePickPlace")
-    assert client.wait_for_server(20.0)
+    assert client.wait_for_server(60.0)
     said: list[int] = []
 
     def send(number: int, tenths_s: int) -> Any:
@@ -205,7 +205,7 @@ def test_a_service_answers_many_calls_at_once_and_the_first_one_too(echo: Proces
                 # rclpy keeps ten answers.
                 futures = [client.call_async(kind.Request(names=[str(call)])) for call in range(8)]
                 for future in futures:
-                    caller.wait(future, "answer of each call", 10.0)
+                    caller.wait(future, "answer of each call")
 
 
 # --- latched topics, restarts, names
@@ -230,11 +230,11 @@ def test_a_node_comes_back_while_rclpy_stays(start, peer: Peer) -> None:
     client = peer.node.create_client(GetState, "/again/camera_fusion/get_state")
     for way_to_end in (signal.SIGKILL, signal.SIGTERM):
         process = start("camera_fusion", "--ros-args", "-r", "__ns:=/again")
-        assert client.wait_for_service(20.0)
+        assert client.wait_for_service(60.0)
         # A killed node stands in the graph until its lease ends: requests go to both.
         peer.until(lambda: answers(peer, client), "answer")
         process.signal(way_to_end)
-        process.wait(5.0)
+        process.wait(60.0)
     peer.node.destroy_client(client)
 
 
@@ -278,8 +278,10 @@ def test_two_cells_live_in_one_domain_by_namespace_and_remap(start, peer: Peer) 
     assert {message.delta for message in a} == {1.0}
     assert {message.delta for message in b} == {2.0}
     # Private names follow the node's new name.
-    services = dict(peer.node.get_service_names_and_types_by_node("other_echo", "/cell_b"))
-    assert "/cell_b/other_echo/get_parameters" in services
+    services = peer.node.get_service_names_and_types_by_node
+    peer.until(
+        lambda: "/cell_b/other_echo/get_parameters" in dict(services("other_echo", "/cell_b")), "service of the new name"
+    )
 
 
 def test_rclpy_sees_names_types_and_qos_of_the_graph(start, peer: Peer) -> None:
@@ -304,8 +306,12 @@ def test_rclpy_sees_names_types_and_qos_of_the_graph(start, peer: Peer) -> None:
 
     peer.until(lambda: "/seen/heightmap" in published(), "names of topics")
     assert published()["/seen/heightmap"] == ["sctn_msgs/msg/Heightmap"]
-    services = dict(node.get_service_names_and_types_by_node("camera_fusion", "/seen"))
-    assert services["/seen/camera_fusion/change_state"] == ["lifecycle_msgs/srv/ChangeState"]
+
+    def served() -> Any:
+        return dict(node.get_service_names_and_types_by_node("camera_fusion", "/seen"))
+
+    peer.until(lambda: "/seen/camera_fusion/change_state" in served(), "names of services")
+    assert served()["/seen/camera_fusion/change_state"] == ["lifecycle_msgs/srv/ChangeState"]
 
 
 def test_type_hashes_of_our_endpoints_are_not_told_over_dds(echo: Process, peer: Peer) -> None:
@@ -374,8 +380,14 @@ def test_parameters_are_listed_described_and_got(fusion: str, peer: Peer) -> Non
 
 def test_parameters_are_set_one_by_one_or_all_or_none_and_events_tell(fusion: str, peer: Peer) -> None:
     events = peer.listen(ParameterEvent, "/parameter_events")
-    peer.until(lambda: peer.node.count_publishers("/parameter_events") > 1, "publisher of events")
-    time.sleep(1.0)
+
+    def heard() -> bool:
+        # The first events may find nobody.
+        request = SetParameters.Request(parameters=[double("tolerance_s", 0.04)])
+        peer.call(SetParameters, f"{fusion}/set_parameters", request)
+        return any(event.node == fusion for event in events) or time.sleep(0.1)
+
+    peer.until(heard, "event of the node")
     good, too_small, fixed = double("tolerance_s", 0.03), double("camera_timeout_s", -1.0), double("workspace.z_max_m", 1.0)
     unknown = double("no_such_parameter", 1.0)
     wrong = Parameter(name="tolerance_s", value=ParameterValue(type=ParameterType.PARAMETER_STRING, string_value="x"))
@@ -433,7 +445,8 @@ def test_lifecycle_goes_through_all_transitions(start, peer: Peer) -> None:
     wait_for_node(peer, "camera_fusion", "/led")
     life = Life(peer, "/led/camera_fusion")
     peer.until(lambda: peer.node.count_publishers("/led/camera_fusion/transition_event"), "events")
-    time.sleep(1.0)
+    # And until the node knows the listener, too.
+    time.sleep(3.0)
     assert life.state() == "unconfigured"
     states = peer.call(GetAvailableStates, "/led/camera_fusion/get_available_states").available_states
     assert {one.id for one in states} >= {0, 1, 2, 3, 4, 10, 11, 12, 13, 14, 15}
@@ -465,13 +478,14 @@ def test_lifecycle_goes_through_all_transitions(start, peer: Peer) -> None:
     assert peer.call(SetParameters, "/led/camera_fusion/set_parameters", request).results[0].successful
     assert not life.change("configure")
     assert life.state() == "unconfigured"
-    assert "no/such/file.yaml" in process.errors()
+    peer.until(lambda: "no/such/file.yaml" in process.errors(), "reason in the log")
     calibration.string_value = ""
     assert peer.call(SetParameters, "/led/camera_fusion/set_parameters", request).results[0].successful
     assert life.change("configure") and life.change("activate")
     assert life.change("shutdown")
     assert life.state() == "finalized"
     assert life.available() == set()
+    peer.until(lambda: life.events and life.events[-1].goal_state.label == "finalized", "last event")
     way = [(event.start_state.label, event.goal_state.label) for event in life.events]
     round_trip = [("inactive", "activating"), ("activating", "active"), ("active", "deactivating"), ("deactivating", "inactive")]
     configured = [("unconfigured", "configuring"), ("configuring", "inactive")]
@@ -490,7 +504,7 @@ def test_lifecycle_goes_through_all_transitions(start, peer: Peer) -> None:
     ]
     assert {event.transition.id for event in life.events} == {1, 2, 3, 4, 7, 10, 11, 20, 30, 40, 50}
     process.signal(signal.SIGINT)
-    assert process.wait(5.0) == 0
+    assert process.wait(60.0) == 0
 
 
 # --- time, logs, diagnostics, end
@@ -553,8 +567,11 @@ def test_diagnostics_tell_rates_ages_drops_and_the_last_error(start, peer: Peer)
         return bool(counts) and int(counts[5]) > 0 and float(counts[2]) > 1 and bool(values.get(f"{topic} last_error"))
 
     peer.until(told, "diagnostics of the topic")
-    states = {status.name: status.message for array in arrays for status in array.status}
-    assert states["/ill/camera_fusion: lifecycle"] == "active"
+
+    def state() -> str:
+        return {one.name: one.message for array in arrays for one in array.status}["/ill/camera_fusion: lifecycle"]
+
+    peer.until(lambda: state() == "active", "state in the diagnostics")
 
 
 def test_a_qos_mismatch_is_said_with_both_ends_in_log_and_diagnostics(start, peer: Peer) -> None:
@@ -601,7 +618,7 @@ def test_a_signal_ends_a_node_cleanly(start, peer: Peer, number: signal.Signals)
     life = Life(peer, f"{namespace}/camera_fusion")
     peer.until(lambda: life.state() == "active", "active node")
     process.signal(number)
-    assert process.wait(5.0) == 0
+    assert process.wait(60.0) == 0
     assert "finalized" in process.errors()
     peer.until(
         lambda: ("camera_fusion", namespace) not in peer.node.get_node_names_and_namespaces()
@@ -636,8 +653,8 @@ def test_parameter_files_reach_the_nodes_they_name(start, peer: Peer, tmp_path: 
     assert [value.double_value for value in values] == [0.5, 7.0]
 
 
-def test_nodes_of_another_domain_are_not_seen(start, peer: Peer, domain: int) -> None:
-    other = domain % 100 + 1
+def test_nodes_of_another_domain_are_not_seen(start, peer: Peer) -> None:
+    other = free_domain()
     start("camera_fusion", "--ros-args", "-r", "__ns:=/far", domain=other)
     with Peer(other, "neighbour") as neighbour:
         wait_for_node(neighbour, "camera_fusion", "/far")

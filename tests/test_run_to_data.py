@@ -27,7 +27,7 @@ def run(start_for_module, tmp_path_factory: pytest.TempPathFactory) -> pathlib.P
     """The folder of a recorded run of placing."""
     folder = tmp_path_factory.mktemp("recorded") / "run"
     launch = start_for_module("sctn", "launch", "--problem", "placing", "--seed", 10005, "--record", folder)
-    assert launch.wait(200.0) == 0, launch.log()
+    assert launch.wait(400.0) == 0, launch.log()
     return folder
 
 
@@ -42,7 +42,7 @@ def test_training_takes_recorded_runs(start, run: pathlib.Path, tmp_path: pathli
     train = start(
         "sctn", "train", "--recipe", tmp_path / "recipe.yaml", "--demos", run, run / "run", "--out", tmp_path / "out", "--json"
     )
-    assert train.wait(200.0) == 0, train.log()
+    assert train.wait(400.0) == 0, train.log()
     assert pathlib.Path(json.loads(train.output().splitlines()[-1])["policy"]).is_file()
     assert "2 demonstrations" in train.errors()
 

@@ -14,7 +14,7 @@ use msgs::{
 use node_kit::{Context, Network, NoParameters, Node, Publisher, Qos, RosArguments};
 use tokio::time::timeout;
 
-const LIMIT: Duration = Duration::from_secs(20);
+const LIMIT: Duration = Duration::from_secs(60);
 
 struct CameraDriver {
     name: &'static str,
@@ -109,7 +109,7 @@ async fn three_cameras_become_one_heightmap_in_time() {
         }
         let sent = Instant::now();
         // Images are best effort: a set may be lost.
-        let Ok(heightmap) = timeout(Duration::from_millis(300), heightmaps.recv()).await else {
+        let Ok(heightmap) = timeout(Duration::from_secs(1), heightmaps.recv()).await else {
             continue;
         };
         assert_eq!(

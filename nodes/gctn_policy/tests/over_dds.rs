@@ -15,7 +15,7 @@ use node_kit::{
 };
 use tokio::time::timeout;
 
-const LIMIT: Duration = Duration::from_secs(30);
+const LIMIT: Duration = Duration::from_secs(60);
 const CELLS: usize = 32;
 
 fn network() -> NetworkConfig {
@@ -167,7 +167,7 @@ async fn proposals_follow_goals_rejections_and_changed_scenes() {
         outcome: StepResult::PLACED,
         ..StepResult::default()
     });
-    tokio::time::sleep(Duration::from_millis(300)).await;
+    tokio::time::sleep(Duration::from_secs(1)).await;
     heightmaps.publish(heightmap(CELLS, 4, 2));
     let none = timeout(Duration::from_secs(1), proposals.recv()).await;
     assert!(none.is_err(), "{none:?}");

@@ -11,7 +11,7 @@ use node_kit::{Context, Network, NoParameters, ParameterSource, Qos, RosArgument
 use pick_place::{Outcome, PrimitiveSettings};
 use tokio::time::timeout;
 
-const LIMIT: Duration = Duration::from_secs(20);
+const LIMIT: Duration = Duration::from_secs(60);
 
 fn heightmap(height_m: f32) -> Heightmap {
     let mut heightmap = Heightmap::new(Workspace::RAVENS);
@@ -133,8 +133,8 @@ async fn results_and_confirmations_walk_through_a_demonstration() {
             .await
     );
 
-    // An operator looks before speaking, and a motion takes its time.
-    let pause = || tokio::time::sleep(Duration::from_millis(200));
+    // An operator looks before speaking, and a motion takes its time: the proposal is there before its result.
+    let pause = || tokio::time::sleep(Duration::from_secs(1));
     let propose = async |id, step, attempt| {
         proposals.publish(PickPlace {
             id,

@@ -12,7 +12,7 @@ use node_kit::{Context, Network, NoParameters, Node, Publisher, Qos, RosArgument
 const NODES: usize = 8;
 const TOPICS: usize = 24;
 const ROUNDS: usize = 12;
-const PATIENCE: Duration = Duration::from_secs(30);
+const PATIENCE: Duration = Duration::from_secs(120);
 
 /// A node that speaks and listens on all topics.
 struct Member {

@@ -25,12 +25,12 @@ async fn call<S: Service + 'static>(
     request: S::Request,
 ) -> Result<S::Response> {
     let client = node.service_client::<S>(&format!("/rosbag2_player/{name}"))?;
-    client.wait_for_server(Duration::from_secs(20)).await?;
+    client.wait_for_server(Duration::from_secs(60)).await?;
     Ok(client.call(&request, &CallOptions::default()).await?)
 }
 
 async fn next(texts: &mut Subscription<std_msgs::String>) -> Result<String> {
-    let text = tokio::time::timeout(Duration::from_secs(20), texts.recv()).await;
+    let text = tokio::time::timeout(Duration::from_secs(60), texts.recv()).await;
     Ok(text.context("no message")?.data)
 }
 
@@ -56,7 +56,7 @@ async fn a_paused_player_goes_message_by_message_and_on_when_told() -> Result<()
     let (node, _) = context.node::<NoParameters>("tester", &RosArguments::default())?;
     let mut texts = node.subscription::<std_msgs::String>("/chatter", node_kit::Qos::Latched)?;
     let player = Command::new(env!("CARGO_BIN_EXE_sctn"))
-        .args(["bag", "play", "--paused", "--wait", "20"])
+        .args(["bag", "play", "--paused", "--wait", "60"])
         .arg(&bag)
         .env("ROS_DOMAIN_ID", DOMAIN.to_string())
         .env("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")

@@ -17,7 +17,7 @@ use msgs::sctn_msgs::{Goal, PickPlace, Reward, StepConfirmation, StepResult};
 use multiravens::Environment;
 use node_kit::{Node, Qos, ns_from_stamp, wait_for_end};
 use operator::{Operator, OperatorKind, Question, automatic};
-use recording::{LAST_HEIGHTMAP, RunRecorder};
+use recording::{LAST_HEIGHTMAP, LAST_WORDS, RunRecorder};
 use serde::Serialize;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
@@ -197,6 +197,7 @@ impl Launch {
             let measured_ns = ended.is_ok().then_some(desk.measured_ns);
             recorder.last_words(measured_ns).await;
         }
+        tokio::time::sleep(LAST_WORDS).await;
         graph.stop(&context).await;
         let bag = match recorder {
             Some(recorder) => {

@@ -16,7 +16,7 @@ use std::time::Duration;
 
 const CAMERAS: [&str; 3] = ["front", "left", "right"];
 /// What was sent last may still be on its way, or have to be sent again: who sent it must live so long.
-const LAST_WORDS: Duration = Duration::from_millis(500);
+pub const LAST_WORDS: Duration = Duration::from_millis(500);
 /// How long the desk may take to find the recorder.
 const DISCOVERY: Duration = Duration::from_secs(20);
 /// How long what shows the end of the run may take: images are best effort, and said again twice a second.
@@ -86,7 +86,7 @@ impl RunRecorder {
         }
     }
 
-    /// Waits for what is still on its way, and for a heightmap that is not older than `measured_ns`, if there is one to come;
+    /// Waits for a heightmap that is not older than `measured_ns`, if there is one to come;
     /// to be called before the nodes end.
     pub async fn last_words(&self, measured_ns: Option<i64>) {
         let shown = async {
@@ -97,7 +97,6 @@ impl RunRecorder {
         if tokio::time::timeout(LAST_HEIGHTMAP, shown).await.is_err() {
             tracing::warn!("the bag has no heightmap of after the last step");
         }
-        tokio::time::sleep(LAST_WORDS).await;
     }
 
     /// Waits until the recording has ended by itself.

@@ -280,9 +280,7 @@ async fn hostile_traffic_on_every_topic_and_service_ends_no_node() -> Result<()>
     let mut heightmaps = node.subscription::<Heightmap>("heightmap", Qos::Latched)?;
     let mut results = node.subscription::<StepResult>("step_result", Qos::Event)?;
     let confirmations = node.publisher::<StepConfirmation>("step_confirmation", Qos::Event)?;
-    // What the substitute says is heard like the policy's.
-    let (substitute, _) = context.node::<NoParameters>("substitute", &RosArguments::default())?;
-    let substitute_proposals = substitute.publisher::<PickPlace>("pick_place", Qos::Latched)?;
+    let substitute_proposals = node.publisher::<PickPlace>("pick_place", Qos::Latched)?;
     let driver = |topic: &str| format!("io_and_status_controller/{topic}");
     let robot_mode = node.publisher::<RobotMode>(&driver("robot_mode"), Qos::Latched)?;
     let safety_mode = node.publisher::<SafetyMode>(&driver("safety_mode"), Qos::Latched)?;

@@ -26,10 +26,12 @@ use suction::Suction;
 /// Physics steps in a second of simulated time.
 pub const STEPS_PER_SECOND: u32 = 480;
 
-/// The engine's substeps of a step, and as many where a chain's joint gapes further than this or a
-/// bead whips: the cable is pulled hard, or hits something.
+/// The engine's substeps of a step, and as many where a chain's joint gapes further than this, a
+/// bead whips, or a held body is twisted further than this in the grip: the cable is pulled hard, or
+/// hits something.
 const SUBSTEPS: (usize, usize) = (4, 16);
 const GAPING_M: f64 = 0.8e-3;
+const TWISTED_RAD: f64 = 0.1;
 
 /// Manifold points closer than this count as contact.
 const CONTACT_DISTANCE_M: f32 = 0.2e-3;
@@ -262,8 +264,9 @@ impl World {
         let last = self.physics.integration_parameters.num_solver_iterations;
         let speed_m_s = self.fastest_bead_m_s();
         // What rests needs no look at its joints.
-        let strains =
-            speed_m_s > WHIP_M_S || speed_m_s > 0.0 && self.widest_joint_error_m() > GAPING_M;
+        let strains = speed_m_s > WHIP_M_S
+            || self.twist_rad() > TWISTED_RAD
+            || speed_m_s > 0.0 && self.widest_joint_error_m() > GAPING_M;
         if strains {
             (2 * last).clamp(usual, strained)
         } else {

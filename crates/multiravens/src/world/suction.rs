@@ -9,7 +9,7 @@ use nalgebra::Isometry3;
 use rapier3d::prelude::{
     ColliderBuilder, ColliderHandle, FixedJointBuilder, GenericJointBuilder, Group,
     ImpulseJointHandle, InteractionGroups, JointAxesMask, JointAxis, MassProperties, MotorModel,
-    PhysicsWorld, RigidBodyBuilder, RigidBodyHandle, Vector,
+    PhysicsWorld, Pose, RigidBodyBuilder, RigidBodyHandle, Vector,
 };
 
 /// Half of the width and of the length of the tool's end, a box because the engine's contacts of
@@ -46,6 +46,8 @@ pub(super) struct Suction {
 struct Grip {
     joint: ImpulseJointHandle,
     body: BodyId,
+    /// As gripped.
+    held_from_tip: Pose,
 }
 
 impl Suction {
@@ -137,7 +139,11 @@ impl World {
             .physics
             .impulse_joints
             .insert(self.suction.tip, handle, joint, true);
-        self.suction.grip = Some(Grip { joint, body });
+        self.suction.grip = Some(Grip {
+            joint,
+            body,
+            held_from_tip,
+        });
         let force_n = self.bodies[body.0].suction_force_n;
         self.suction.limit_force(&mut self.physics, force_n);
         // What is held shields the cup.
@@ -194,6 +200,16 @@ impl World {
                     _ => true,
                 }
             })
+    }
+
+    /// How far what is held is turned away from how it was gripped.
+    pub(super) fn twist_rad(&self) -> f64 {
+        self.suction.grip.as_ref().map_or(0.0, |grip| {
+            let held = self.physics.bodies[self.bodies[grip.body.0].handle].position();
+            let tip = self.physics.bodies[self.suction.tip].position();
+            let now = held.inv_mul(tip).rotation;
+            now.angle_between(grip.held_from_tip.rotation).into()
+        })
     }
 
     /// How far the tip is behind the head.

@@ -227,10 +227,10 @@ impl FusionNode {
 
     fn fuse(&mut self) {
         let start = Instant::now();
-        match self.views.fuse() {
-            Ok(None) => {}
-            Ok(Some(fused)) => self.publish(fused, start),
-            Err(complaints) => complaints.iter().for_each(|bad| self.complain(bad)),
+        let (fused, complaints) = self.views.fuse();
+        complaints.iter().for_each(|bad| self.complain(bad));
+        if let Some(fused) = fused {
+            self.publish(fused, start);
         }
     }
 

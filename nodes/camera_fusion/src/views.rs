@@ -62,7 +62,8 @@ struct CameraState {
 /// A set of images belongs together when each camera has a colour and a depth image whose stamps are
 /// within `tolerance_s` of one reference stamp. The reference is the newest colour stamp for which that
 /// holds; of several images of a stream the nearest is taken. A set is fused once: it must be newer than
-/// the last one. A silent camera is waited for, unless `fuse_without_silent`.
+/// the last one. One that cannot be used, such as of a frame without a transform, holds up no older one.
+/// A silent camera is waited for, unless `fuse_without_silent`.
 pub struct Views {
     cameras: Vec<CameraState>,
     transforms: Transforms,
@@ -196,11 +197,25 @@ impl Views {
         Ok(set_back)
     }
 
-    /// Fuses the newest set, if there is a new one.
-    pub fn fuse(&mut self) -> Result<Option<Fused>, Vec<Complaint>> {
-        let Some(reference) = self.reference() else {
-            return Ok(None);
-        };
+    /// Fuses the newest new set that can be used, if there is one; and what is wrong with still newer ones.
+    pub fn fuse(&mut self) -> (Option<Fused>, Vec<Complaint>) {
+        let mut complaints = Vec::new();
+        let mut before = Duration::MAX;
+        while let Some(reference) = self.newest_reference(before) {
+            match self.fuse_at(reference) {
+                Ok(fused) => return (Some(fused), complaints),
+                Err(bad) => bad.into_iter().for_each(|bad| {
+                    if !complaints.contains(&bad) {
+                        complaints.push(bad);
+                    }
+                }),
+            }
+            before = reference;
+        }
+        (None, complaints)
+    }
+
+    fn fuse_at(&mut self, reference: Duration) -> Result<Fused, Vec<Complaint>> {
         let (mut cameras, mut complaints) = (Vec::new(), Vec::new());
         let without = self.fuse_without_silent;
         for (index, state) in self.cameras.iter_mut().enumerate() {
@@ -258,16 +273,16 @@ impl Views {
                 report.coverage,
             )
         });
-        Ok(Some(Fused {
+        Ok(Fused {
             message: message.map_err(|error| general(error.to_string()))?,
             heightmap: self.heightmap.clone(),
             stamp,
             used,
-        }))
+        })
     }
 
-    /// The newest colour stamp about which every camera has an image of both streams.
-    fn reference(&self) -> Option<Duration> {
+    /// The newest colour stamp before another about which every camera has an image of both streams.
+    fn newest_reference(&self, before: Duration) -> Option<Duration> {
         let near = |waiting: &VecDeque<(Duration, Image)>, reference: Duration| {
             waiting
                 .iter()
@@ -282,10 +297,10 @@ impl Views {
         stamps
             .map(|(stamp, _)| *stamp)
             .filter(|reference| {
-                self.cameras
-                    .iter()
-                    .filter(waited_for)
-                    .all(|state| near(&state.color, *reference) && near(&state.depth, *reference))
+                let complete = |state: &CameraState| {
+                    near(&state.color, *reference) && near(&state.depth, *reference)
+                };
+                *reference < before && self.cameras.iter().filter(waited_for).all(complete)
             })
             .max()
     }
@@ -455,7 +470,9 @@ mod tests {
     }
 
     fn fused_stamp_ms(views: &mut Views) -> Option<u128> {
-        let fused = views.fuse().unwrap()?;
+        let (fused, complaints) = views.fuse();
+        assert!(complaints.is_empty(), "{complaints:?}");
+        let fused = fused?;
         Some(
             convert::time_from_msg(&fused.message.header.stamp)
                 .unwrap()
@@ -467,9 +484,9 @@ mod tests {
     fn views_of_one_stamp_become_one_heightmap() {
         let mut views = ready();
         send(&mut views, 0, 1000);
-        assert_eq!(views.fuse().unwrap(), None);
+        assert_eq!(views.fuse(), (None, vec![]));
         send(&mut views, 1, 1000);
-        let fused = views.fuse().unwrap().unwrap();
+        let fused = views.fuse().0.unwrap();
         assert_eq!(fused.message.views, 2);
         assert_eq!(fused.message.header.frame_id, "world");
         assert!(fused.message.coverage > 0.0);
@@ -522,7 +539,7 @@ mod tests {
         send(&mut views, 0, 1000);
         send(&mut views, 0, 1033);
         send(&mut views, 1, 1021);
-        let fused = views.fuse().unwrap().unwrap();
+        let fused = views.fuse().0.unwrap();
         let at = |stamp_ms| {
             let stamp = Duration::from_millis(stamp_ms);
             Some(Used {
@@ -546,9 +563,9 @@ mod tests {
             views.transform(extrinsics(&["front", "left"]));
             calibrate(&mut views);
             send(&mut views, 0, 1000);
-            assert_eq!(views.fuse().unwrap(), None);
+            assert_eq!(views.fuse(), (None, vec![]));
             views.set_silent(1, true);
-            let fused = views.fuse().unwrap();
+            let (fused, _) = views.fuse();
             assert_eq!(fused.is_some(), without);
             if let Some(fused) = fused {
                 assert_eq!((fused.message.views, fused.used[1]), (1, None));
@@ -556,9 +573,9 @@ mod tests {
             // It comes back: both again.
             views.set_silent(1, false);
             send(&mut views, 0, 1100);
-            assert_eq!(views.fuse().unwrap(), None);
+            assert_eq!(views.fuse(), (None, vec![]));
             send(&mut views, 1, 1100);
-            assert_eq!(views.fuse().unwrap().unwrap().message.views, 2);
+            assert_eq!(views.fuse().0.unwrap().message.views, 2);
         }
     }
 
@@ -574,7 +591,7 @@ mod tests {
         let mut heightmaps = 0;
         for (_, camera, stamp_ms) in arrivals {
             send(&mut views, camera, stamp_ms);
-            if let Some(fused) = views.fuse().unwrap() {
+            if let Some(fused) = views.fuse().0 {
                 let [front, left] = [0, 1].map(|camera| fused.used[camera].unwrap().color);
                 assert!(front.abs_diff(left) <= Duration::from_millis(20));
                 heightmaps += 1;
@@ -601,11 +618,29 @@ mod tests {
         views.transform(extrinsics(&["front"]));
         send(&mut views, 0, 1000);
         send(&mut views, 1, 1000);
-        let complaints = views.fuse().unwrap_err();
+        let complaints = views.fuse().1;
         assert_eq!((complaints.len(), complaints[0].camera), (1, 1));
         assert!(complaints[0].reason.contains("\"left\""), "{complaints:?}");
         views.transform(extrinsics(&["left"]));
         assert_eq!(fused_stamp_ms(&mut views), Some(1000));
+    }
+
+    #[test]
+    fn images_of_later_stamps_that_cannot_be_used_hold_up_no_others() {
+        let mut views = ready();
+        let later = Duration::from_secs(3);
+        for camera in 0..2 {
+            let (color, depth) = (color(later, ""), depth(later, "", 0.05));
+            views.image(camera, Stream::Color, color).unwrap();
+            views.image(camera, Stream::Depth, depth).unwrap();
+        }
+        for stamp_ms in [1000, 1100] {
+            send(&mut views, 0, stamp_ms);
+            send(&mut views, 1, stamp_ms);
+            let (fused, complaints) = views.fuse();
+            assert_eq!(fused.unwrap().stamp, Duration::from_millis(stamp_ms));
+            assert_eq!(complaints.len(), 2, "{complaints:?}");
+        }
     }
 
     #[test]
@@ -616,13 +651,13 @@ mod tests {
         let mut truncated = color(Duration::from_millis(1000), "left");
         truncated.data.truncate(100);
         views.image(1, Stream::Color, truncated).unwrap();
-        let complaints = views.fuse().unwrap_err();
+        let complaints = views.fuse().1;
         assert_eq!(
             (complaints[0].camera, complaints[0].stream),
             (1, Stream::Color)
         );
         assert!(complaints[0].reason.contains("data"), "{complaints:?}");
-        assert_eq!(views.fuse().unwrap(), None);
+        assert_eq!(views.fuse(), (None, vec![]));
         send(&mut views, 0, 1100);
         send(&mut views, 1, 1100);
         assert_eq!(fused_stamp_ms(&mut views), Some(1100));
@@ -637,7 +672,7 @@ mod tests {
         assert_eq!((complaint.camera, complaint.stream), (1, Stream::Info));
         send(&mut views, 0, 1000);
         send(&mut views, 1, 1000);
-        assert_eq!(views.fuse().unwrap_err()[0].stream, Stream::Info);
+        assert_eq!(views.fuse().1[0].stream, Stream::Info);
         calibrate(&mut views);
         assert_eq!(fused_stamp_ms(&mut views), Some(1000));
     }
@@ -657,7 +692,7 @@ mod tests {
                 .image(camera, Stream::Color, color(stamp, frame))
                 .unwrap();
         }
-        let fused = views.fuse().unwrap().unwrap();
+        let fused = views.fuse().0.unwrap();
         assert!(
             fused
                 .message

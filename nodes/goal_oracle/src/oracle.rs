@@ -379,7 +379,8 @@ impl Oracle {
         ((self.index as u32 + 1).min(count), count, self.attempt)
     }
 
-    /// A proposal was published. The newest for the present goal is current, until the arm moves.
+    /// A proposal was published. The newest for the present goal is current, until the arm moves; one
+    /// that is said again is the newest again.
     pub fn proposed(&mut self, proposal: &PickPlace) {
         let of_this_goal = !self.stopped
             && self.goals.get(self.index).is_some_and(|goal| {
@@ -391,10 +392,10 @@ impl Oracle {
             return;
         }
         let moved = self.current.is_some_and(|current| current.moved.is_some());
-        let known = self.seen.contains(&proposal.id) || self.superseded.contains(&proposal.id);
-        if moved || known {
+        if moved || self.seen.contains(&proposal.id) {
             return;
         }
+        self.superseded.remove(&proposal.id);
         match &self.current {
             Some(current) if current.id == proposal.id => {}
             other => {
@@ -793,6 +794,21 @@ mod tests {
         // Said again, it is a proposal of an earlier goal.
         oracle.result(&result(7, StepResult::PLACED, 5));
         assert_eq!(oracle.progress(), (2, 2, 0));
+    }
+
+    #[test]
+    fn a_proposal_said_again_may_be_decided_on_before_its_result_comes() {
+        let mut oracle = oracle(2);
+        oracle.proposed(&proposal(7, 1, 0));
+        oracle.proposed(&proposal(8, 1, 0));
+        // What the policy does when the executor has refused 8.
+        oracle.proposed(&proposal(7, 1, 0));
+        assert_eq!(
+            oracle.confirmed(&says(StepConfirmation::ADVANCE, 7)),
+            Ok(Change::None)
+        );
+        let change = oracle.result(&result(7, StepResult::PLACED, 5));
+        assert_eq!(goal(change), (2, 0, 5, false));
     }
 
     #[test]

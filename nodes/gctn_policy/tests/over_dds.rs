@@ -81,10 +81,7 @@ async fn proposals_follow_goals_rejections_and_changed_scenes() {
         .unwrap()
         .save_checkpoint(&checkpoint, Storage::F32, &ModelCard::new())
         .unwrap();
-    let context = Context::new(DdsNetwork {
-        domain_id: 53,
-        localhost_only: true,
-    });
+    let context = Context::new(DdsNetwork::unused().unwrap());
     let (node, _) = context
         .node::<NoParameters>("others", &RosArguments::default())
         .unwrap();
@@ -177,10 +174,7 @@ async fn proposals_follow_goals_rejections_and_changed_scenes() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn without_a_checkpoint_the_node_refuses_to_start() {
-    let context = Context::new(DdsNetwork {
-        domain_id: 53,
-        localhost_only: true,
-    });
+    let context = Context::new(DdsNetwork::unused().unwrap());
     let policy = context
         .start(
             "gctn_policy",

@@ -88,10 +88,7 @@ async fn results_and_confirmations_walk_through_a_demonstration() {
     let directory = tempfile::tempdir().unwrap();
     let bag = directory.path().join("demonstration");
     demonstration().write(&bag).unwrap();
-    let context = Context::new(Network {
-        domain_id: 52,
-        localhost_only: true,
-    });
+    let context = Context::new(Network::unused().unwrap());
     let (node, _) = context
         .node::<NoParameters>("others", &RosArguments::default())
         .unwrap();
@@ -197,11 +194,7 @@ async fn by_image_distance_what_is_seen_after_a_motion_says_which_goal_is_next()
     let directory = tempfile::tempdir().unwrap();
     let bag = directory.path().join("demonstration");
     demonstration().write(&bag).unwrap();
-    let context = Context::new(Network {
-        // Of its own: the other tests run beside it.
-        domain_id: 58,
-        localhost_only: true,
-    });
+    let context = Context::new(Network::unused().unwrap());
     let (node, _) = context
         .node::<NoParameters>("others", &RosArguments::default())
         .unwrap();
@@ -274,10 +267,7 @@ async fn by_image_distance_what_is_seen_after_a_motion_says_which_goal_is_next()
 
 #[tokio::test(flavor = "multi_thread")]
 async fn without_a_demonstration_the_node_refuses_to_start() {
-    let context = Context::new(Network {
-        domain_id: 52,
-        localhost_only: true,
-    });
+    let context = Context::new(Network::unused().unwrap());
     let oracle = context
         .start(
             "goal_oracle",

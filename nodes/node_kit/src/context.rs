@@ -2,8 +2,9 @@
 
 use std::{
     env,
-    net::{IpAddr, Ipv4Addr},
-    process::ExitCode,
+    net::{IpAddr, Ipv4Addr, UdpSocket},
+    process::{self, ExitCode},
+    sync::atomic::{AtomicU16, Ordering},
     time::Duration,
 };
 
@@ -55,9 +56,36 @@ pub enum ContextError {
         /// Why.
         reason: String,
     },
+    /// Somebody is in each of them.
+    #[error("no ROS domain id from 1 to {LAST_DOMAIN_ID} is unused on this machine")]
+    NoUnusedDomain,
 }
 
+/// The ports of domains above are among those that Linux hands out to anybody.
+const LAST_DOMAIN_ID: u16 = 100;
+
 impl Network {
+    /// This machine alone, in a domain whose discovery ports nobody has here; for each call another one.
+    pub fn unused() -> Result<Self, ContextError> {
+        static CALLS: AtomicU16 = AtomicU16::new(0);
+        let call = CALLS.fetch_add(1, Ordering::Relaxed) % LAST_DOMAIN_ID;
+        // Processes of today that ask at the same time begin elsewhere.
+        let start = (process::id() % u32::from(LAST_DOMAIN_ID)) as u16 + 7 * call;
+        let free = |port| UdpSocket::bind((Ipv4Addr::UNSPECIFIED, port)).is_ok();
+        let domain_id = (0..LAST_DOMAIN_ID)
+            .map(|offset| 1 + (start + offset) % LAST_DOMAIN_ID)
+            .find(|id| {
+                // Of the domain, then of its participants (DDSI-RTPS 2.5, 9.6.2.3).
+                let first = 7400 + 250 * id;
+                (first..first + 2).chain(first + 10..first + 20).all(free)
+            })
+            .ok_or(ContextError::NoUnusedDomain)?;
+        Ok(Self {
+            domain_id,
+            localhost_only: true,
+        })
+    }
+
     /// As ROS 2 reads the environment: ROS_DOMAIN_ID, ROS_AUTOMATIC_DISCOVERY_RANGE (SUBNET,
     /// LOCALHOST, SYSTEM_DEFAULT) and the older ROS_LOCALHOST_ONLY.
     pub fn from_environment() -> Result<Self, ContextError> {
@@ -321,6 +349,18 @@ mod tests {
                 .find(|(key, _)| *key == name)
                 .map(|(_, value)| (*value).to_owned())
         })
+    }
+
+    #[test]
+    fn a_domain_that_somebody_is_in_is_not_unused() {
+        let taken = Network::unused().unwrap();
+        let _somebody = UdpSocket::bind(("0.0.0.0", 7400 + 250 * taken.domain_id + 10)).unwrap();
+        let given: Vec<_> = (0..LAST_DOMAIN_ID)
+            .map(|_| Network::unused().unwrap())
+            .collect();
+        assert!(given.iter().all(|network| network.localhost_only));
+        assert!(!given.contains(&taken));
+        assert_ne!(given[0], given[1]);
     }
 
     #[test]

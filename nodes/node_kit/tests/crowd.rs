@@ -70,10 +70,7 @@ impl Member {
 async fn nodes_that_start_at_once_all_hear_each_other() {
     for round in 0..ROUNDS {
         let start = Instant::now();
-        let network = Network {
-            domain_id: 64,
-            localhost_only: true,
-        };
+        let network = Network::unused().unwrap();
         let members = (0..NODES).map(|number| {
             tokio::task::spawn_blocking(move || {
                 let context = Context::new(network);

@@ -26,13 +26,6 @@ type SetIO = msgs::ur_msgs::SetIO;
 
 const LIMIT: Duration = Duration::from_secs(60);
 
-fn context(domain_id: u16) -> Context {
-    Context::new(Network {
-        domain_id,
-        localhost_only: true,
-    })
-}
-
 fn node(context: &Context, name: &str, arguments: &str) -> Node {
     let words = arguments.split_whitespace().map(str::to_owned);
     let (arguments, _) = RosArguments::parse(words).expect("arguments");
@@ -59,7 +52,7 @@ fn image(number: u32) -> Image {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn images_arrive() {
-    let context = context(41);
+    let context = Context::new(Network::unused().unwrap());
     let sender = node(&context, "sender", "");
     let receiver = node(&context, "receiver", "");
     let publisher = sender.publisher::<Image>("color", Qos::Image).unwrap();
@@ -79,7 +72,7 @@ async fn images_arrive() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn a_latched_message_reaches_a_late_joiner() {
-    let context = context(42);
+    let context = Context::new(Network::unused().unwrap());
     let sender = node(&context, "sender", "");
     let receiver = node(&context, "receiver", "");
     let publisher = sender.publisher::<Header>("goal", Qos::Latched).unwrap();
@@ -102,7 +95,7 @@ async fn a_latched_message_reaches_a_late_joiner() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn a_message_of_another_type_is_counted_and_the_next_one_is_read() {
-    let context = context(43);
+    let context = Context::new(Network::unused().unwrap());
     let (sender, receiver) = (node(&context, "sender", ""), node(&context, "receiver", ""));
     // Another type on the same topic: its bytes cannot be an image.
     let wrong = sender.publisher::<Float64>("x", Qos::Event).unwrap();
@@ -129,7 +122,7 @@ async fn a_message_of_another_type_is_counted_and_the_next_one_is_read() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn services_answer_two_clients() {
-    let context = context(44);
+    let context = Context::new(Network::unused().unwrap());
     let server = node(&context, "server", "");
     let service = server.service_server::<SetIO>("set_io").unwrap();
     let serving = server.spawn(service.serve(|request: SetIORequest| SetIOResponse {
@@ -157,7 +150,7 @@ async fn services_answer_two_clients() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn a_call_without_server_says_so() {
-    let context = context(45);
+    let context = Context::new(Network::unused().unwrap());
     let client = node(&context, "client", "")
         .service_client::<SetIO>("set_io")
         .unwrap();
@@ -200,7 +193,7 @@ fn trajectory(kind: i32) -> FollowJointTrajectoryGoal {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn actions_run_side_by_side_and_end_as_they_should() {
-    let context = context(46);
+    let context = Context::new(Network::unused().unwrap());
     let server_node = node(&context, "server", "");
     let server = server_node
         .action_server::<FollowJointTrajectory>("controller/follow")
@@ -246,7 +239,7 @@ async fn actions_run_side_by_side_and_end_as_they_should() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn simulated_time_comes_from_the_clock_topic() {
-    let context = context(47);
+    let context = Context::new(Network::unused().unwrap());
     let simulator = node(&context, "simulator", "");
     let follower = node(&context, "follower", "--ros-args -p use_sim_time:=true");
     let clock = simulator.publisher::<Clock>("/clock", Qos::Event).unwrap();
@@ -267,7 +260,7 @@ async fn simulated_time_comes_from_the_clock_topic() {
 #[tokio::test(flavor = "multi_thread")]
 async fn logs_reach_rosout_and_diagnostics_name_the_topics() {
     node_kit::logging::init(&[]).unwrap();
-    let context = context(48);
+    let context = Context::new(Network::unused().unwrap());
     let speaker = node(&context, "speaker", "--ros-args -r __ns:=/cell -r a:=b");
     let listener = node(&context, "listener", "");
     let _topic = speaker.publisher::<Header>("a", Qos::Event).unwrap();
@@ -310,7 +303,7 @@ async fn logs_reach_rosout_and_diagnostics_name_the_topics() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn endpoints_that_cannot_talk_are_named_in_diagnostics() {
-    let context = context(49);
+    let context = Context::new(Network::unused().unwrap());
     let sender = node(&context, "sender", "");
     let receiver = node(&context, "receiver", "");
     let _best_effort = sender.publisher::<Header>("x", Qos::Image).unwrap();
@@ -403,8 +396,9 @@ fn integer(integer_value: i64) -> ParameterValue {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn a_node_is_led_through_its_life() {
-    let context = context(40);
-    let (leader, other) = (node(&context, "leader", ""), self::context(40));
+    let network = Network::unused().unwrap();
+    let context = Context::new(network);
+    let (leader, other) = (node(&context, "leader", ""), Context::new(network));
     let words = "--ros-args -p autostart:=false -p period_ms:=13";
     let (arguments, _) = RosArguments::parse(words.split_whitespace().map(str::to_owned)).unwrap();
     let life = other.start("speaker", &arguments, configure).unwrap();

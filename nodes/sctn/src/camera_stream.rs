@@ -1,6 +1,5 @@
 //! `sctn bench camera_stream`: three cameras of 1 MB images at 30 Hz into camera_fusion, a process of its own.
 
-use crate::interfaces::free_domain;
 use crate::root::Root;
 use anyhow::{Context as _, Result, bail, ensure};
 use heightmap::{Camera, Intrinsics};
@@ -120,12 +119,9 @@ pub fn measure(root: &Root, seconds: f64) -> Result<Figures> {
 }
 
 async fn run(root: &Root, seconds: f64) -> Result<Figures> {
-    let domain_id = free_domain(0)?;
-    let mut fusion = Fusion::start(root, domain_id)?;
-    let context = Context::new(Network {
-        domain_id,
-        localhost_only: true,
-    });
+    let network = Network::unused()?;
+    let mut fusion = Fusion::start(root, network.domain_id)?;
+    let context = Context::new(network);
     let (node, _) = context.node::<NoParameters>("cameras", &RosArguments::default())?;
     let cameras = Camera::ravens().map(|camera| Camera {
         intrinsics: INTRINSICS,

@@ -8,7 +8,7 @@ use node_kit::{Context, Network, RosArguments};
 use rustdds::{DomainParticipant, DomainParticipantBuilder, QosPolicies, policy};
 use std::collections::BTreeSet;
 use std::fmt::Write as _;
-use std::net::{IpAddr, Ipv4Addr, UdpSocket};
+use std::net::{IpAddr, Ipv4Addr};
 use std::path::PathBuf;
 use std::time::{Duration, Instant};
 
@@ -167,7 +167,7 @@ struct Watched {
 }
 
 impl Watched {
-    fn start(root: &Root, node: &'static str, domain_id: u16) -> Result<Self> {
+    fn start(root: &Root, node: &'static str) -> Result<Self> {
         let path = |path: &str| root.join(path).display().to_string();
         let mut words = vec![
             "--ros-args".to_owned(),
@@ -191,15 +191,15 @@ impl Watched {
             words.extend(["-p".to_owned(), format!("{name}:={value}")]);
         }
         let (arguments, _) = RosArguments::parse(words)?;
-        let context = Context::new(Network {
-            domain_id,
-            localhost_only: true,
-        });
+        let network = Network::unused()?;
+        let context = Context::new(network);
         graph::start(&context, node, &arguments)?;
-        let viewer = DomainParticipantBuilder::new(domain_id)
+        let viewer = DomainParticipantBuilder::new(network.domain_id)
             .with_only_networks([IpAddr::V4(Ipv4Addr::LOCALHOST)])
             .build()
-            .map_err(|error| anyhow::anyhow!("participant in domain {domain_id}: {error:?}"))?;
+            .map_err(|error| {
+                anyhow::anyhow!("participant in domain {}: {error:?}", network.domain_id)
+            })?;
         Ok(Self {
             node,
             context,
@@ -242,19 +242,6 @@ impl Watched {
     }
 }
 
-/// A domain whose discovery ports nobody on this machine has.
-pub fn free_domain(index: u16) -> Result<u16> {
-    let start = std::process::id() as u16 % 100 + 20 * index;
-    let free = |port| UdpSocket::bind(("0.0.0.0", port)).is_ok();
-    (0..20)
-        .map(|offset| 1 + (start + offset) % 100)
-        .find(|domain| {
-            let first = 7400 + 250 * domain;
-            (first..first + 2).chain(first + 10..first + 20).all(free)
-        })
-        .context("no free ROS domain id between 1 and 100")
-}
-
 fn page(root: &Root) -> Result<String> {
     let runtime = tokio::runtime::Builder::new_multi_thread()
         .enable_all()
@@ -262,8 +249,7 @@ fn page(root: &Root) -> Result<String> {
     let _entered = runtime.enter();
     let watched = NODES
         .iter()
-        .enumerate()
-        .map(|(index, node)| Watched::start(root, node, free_domain(index as u16)?))
+        .map(|node| Watched::start(root, node))
         .collect::<Result<Vec<_>>>()?;
     let begin = Instant::now();
     let mut seen: Vec<BTreeSet<Endpoint>> = vec![BTreeSet::new(); watched.len()];

@@ -13,8 +13,6 @@ use sim_workcell::frames::{CameraTopics, Frame, camera_transforms};
 use std::time::{Duration, Instant};
 use tokio::runtime::Runtime;
 
-/// A domain of its own, on the loopback device only.
-const DOMAIN_ID: u16 = 100;
 const PATIENCE: Duration = Duration::from_secs(10);
 
 /// The two nodes, and cameras that show them one scene again and again.
@@ -76,10 +74,7 @@ impl Chain {
             .enable_all()
             .build()?;
         let entered = runtime.enter();
-        let context = Context::new(node_kit::Network {
-            domain_id: DOMAIN_ID,
-            localhost_only: true,
-        });
+        let context = Context::new(node_kit::Network::unused()?);
         let arguments = |words: &[String]| -> Result<RosArguments> {
             Ok(RosArguments::parse(words.iter().cloned())?.0)
         };

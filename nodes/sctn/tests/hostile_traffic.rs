@@ -16,10 +16,6 @@ use std::path::{Path, PathBuf};
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
-const NETWORK: Network = Network {
-    domain_id: 65,
-    localhost_only: true,
-};
 const SEED: &str = "10006";
 const PATIENCE: Duration = Duration::from_secs(60);
 const DURATION: Duration = Duration::from_secs(60);
@@ -140,8 +136,12 @@ fn garbage(random: &mut ChaCha8Rng) -> Vec<u8> {
 }
 
 /// Sends garbage to every reader of the graph in turn; how many messages to how many readers.
-fn attack(duration: Duration, mut check: impl FnMut() -> Result<()>) -> Result<(usize, usize)> {
-    let participant = DomainParticipantBuilder::new(NETWORK.domain_id)
+fn attack(
+    network: Network,
+    duration: Duration,
+    mut check: impl FnMut() -> Result<()>,
+) -> Result<(usize, usize)> {
+    let participant = DomainParticipantBuilder::new(network.domain_id)
         .with_only_networks([IpAddr::V4(Ipv4Addr::LOCALHOST)])
         .build()
         .map_err(|error| anyhow::anyhow!("{error:?}"))?;
@@ -248,8 +248,9 @@ async fn hostile_traffic_on_every_topic_and_service_ends_no_node() -> Result<()>
         .status()?;
     ensure!(shown.success());
     let demonstration = folder.path().join("placing").join(format!("{SEED:0>6}"));
+    let network = Network::unused()?;
     let environment = BTreeMap::from([
-        ("ROS_DOMAIN_ID", NETWORK.domain_id.to_string()),
+        ("ROS_DOMAIN_ID", network.domain_id.to_string()),
         ("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST".to_owned()),
     ]);
     let path = |path: &str| root().join(path).display().to_string();
@@ -273,7 +274,7 @@ async fn hostile_traffic_on_every_topic_and_service_ends_no_node() -> Result<()>
         ("suction_executor", &[urdf]),
     ];
 
-    let context = Context::new(NETWORK);
+    let context = Context::new(network);
     let (node, _) = context.node::<NoParameters>("tester", &RosArguments::default())?;
     let mut goals = node.subscription::<Goal>("goal", Qos::Latched)?;
     let mut proposals = node.subscription::<PickPlace>("pick_place", Qos::Latched)?;
@@ -306,7 +307,7 @@ async fn hostile_traffic_on_every_topic_and_service_ends_no_node() -> Result<()>
             .map(Running::memory_mb)
             .collect::<Result<_>>()?;
         let mut most = before.clone();
-        let counts = attack(DURATION, || {
+        let counts = attack(network, DURATION, || {
             for (node, most) in nodes.iter_mut().zip(&mut most) {
                 let ended = node.process.try_wait()?;
                 ensure!(ended.is_none(), "{} ended: {ended:?}", node.name);

@@ -7,8 +7,6 @@ use node_kit::{CallOptions, Context, Network, NoParameters, Node, RosArguments, 
 use std::process::{Child, Command, Stdio};
 use std::time::Duration;
 
-const DOMAIN: u16 = 51;
-
 /// Killed when the test ends, however it ends.
 struct Player(Child);
 
@@ -48,17 +46,14 @@ async fn a_paused_player_goes_message_by_message_and_on_when_told() -> Result<()
     }
     writer.finish()?;
 
-    let network = Network {
-        domain_id: DOMAIN,
-        localhost_only: true,
-    };
+    let network = Network::unused()?;
     let context = Context::new(network);
     let (node, _) = context.node::<NoParameters>("tester", &RosArguments::default())?;
     let mut texts = node.subscription::<std_msgs::String>("/chatter", node_kit::Qos::Latched)?;
     let player = Command::new(env!("CARGO_BIN_EXE_sctn"))
         .args(["bag", "play", "--paused", "--wait", "60"])
         .arg(&bag)
-        .env("ROS_DOMAIN_ID", DOMAIN.to_string())
+        .env("ROS_DOMAIN_ID", network.domain_id.to_string())
         .env("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
         .stdin(Stdio::null())
         .spawn()?;

@@ -1,9 +1,7 @@
 //! The simulated cell as a client of the UR driver and a viewer of the cameras sees it.
 
 use std::future::Future;
-use std::net::UdpSocket;
 use std::path::Path;
-use std::sync::atomic::{AtomicU16, Ordering};
 use std::time::Duration;
 
 use msgs::control_msgs::{
@@ -23,20 +21,6 @@ const FOLLOW: &str = "scaled_joint_trajectory_controller/follow_joint_trajectory
 const SET_IO: &str = "io_and_status_controller/set_io";
 const PATIENCE: Duration = Duration::from_secs(60);
 
-/// A domain whose discovery ports nobody on this machine has.
-fn free_domain() -> u16 {
-    static NEXT: AtomicU16 = AtomicU16::new(0);
-    let start = std::process::id() as u16 % 100 + 7 * NEXT.fetch_add(1, Ordering::Relaxed);
-    let free = |port| UdpSocket::bind(("0.0.0.0", port)).is_ok();
-    (0..100)
-        .map(|offset| 1 + (start + offset) % 100)
-        .find(|domain| {
-            let first = 7400 + 250 * domain;
-            (first..first + 2).chain(first + 10..first + 20).all(free)
-        })
-        .expect("a free domain")
-}
-
 async fn within<T>(what: &str, future: impl Future<Output = T>) -> T {
     tokio::time::timeout(PATIENCE, future)
         .await
@@ -45,10 +29,7 @@ async fn within<T>(what: &str, future: impl Future<Output = T>) -> T {
 
 /// Starts the node on a domain of its own; gives a node beside it.
 fn start(parameters: &[(&str, &str)]) -> (Context, Context, Node) {
-    let network = Network {
-        domain_id: free_domain(),
-        localhost_only: true,
-    };
+    let network = Network::unused().unwrap();
     let problems_dir = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../config/problems");
     let mut line = vec!["--ros-args".to_owned()];
     line.extend([

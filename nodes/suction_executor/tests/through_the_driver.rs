@@ -2,9 +2,7 @@
 
 use std::collections::BTreeMap;
 use std::future::Future;
-use std::net::UdpSocket;
 use std::path::Path;
-use std::sync::atomic::{AtomicU16, Ordering};
 use std::time::{Duration, Instant};
 
 use heightmap::{Camera, Fusion, Heightmap, View, Workspace};
@@ -30,21 +28,6 @@ const PATIENCE: Duration = Duration::from_secs(60);
 
 fn problems_dir() -> std::path::PathBuf {
     Path::new(env!("CARGO_MANIFEST_DIR")).join("../../config/problems")
-}
-
-/// A domain whose discovery ports nobody on this machine has.
-fn free_domain() -> u16 {
-    static NEXT: AtomicU16 = AtomicU16::new(0);
-    let start = std::process::id() as u16 % 100 + 7 * NEXT.fetch_add(1, Ordering::Relaxed);
-    (0..100)
-        .map(|offset| 1 + (start + offset) % 100)
-        .find(|domain| {
-            let first = 7400 + 250 * domain;
-            (first..first + 2)
-                .chain(first + 10..first + 20)
-                .all(|port| UdpSocket::bind(("0.0.0.0", port)).is_ok())
-        })
-        .expect("a free domain")
 }
 
 fn arguments(parameters: &[(&str, String)]) -> RosArguments {
@@ -87,10 +70,7 @@ impl Bench {
             // Once for all tests of the process.
             let _ = node_kit::logging::init(&[level]);
         }
-        let network = Network {
-            domain_id: free_domain(),
-            localhost_only: true,
-        };
+        let network = Network::unused().unwrap();
         let own = Context::new(network);
         let (node, _) = own
             .node::<NoParameters>("bench", &RosArguments::default())

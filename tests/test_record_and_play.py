@@ -9,7 +9,6 @@ import pathlib
 import re
 import resource
 import signal
-import statistics
 import subprocess
 
 import yaml
@@ -22,11 +21,6 @@ from std_msgs.msg import String
 from bag_contents import DEEP, STORE, contents, wait_for_recorder, wait_until_heard, writer_of
 from cell_operator import EVENT, LATCHED, STREAM, Operator, nanoseconds
 from processes import BINARIES, environment
-
-
-def gap(times: list[int]) -> float:
-    """How long it is from one to the next, mostly."""
-    return statistics.median(late - early for early, late in itertools.pairwise(times))
 
 
 def end(recorder, code: int = 0) -> dict:
@@ -97,10 +91,10 @@ def test_a_recording_is_split_and_played_as_one(start, operator: Operator, tmp_p
     with AnyReader([bag], default_typestore=STORE) as reader:
         times = [time_ns for _, time_ns, _ in reader.messages()]
     first = sum(time_ns < times[0] + 10**9 for time_ns in times)
-    assert 0 < first < 60
+    assert 0 < first < 25
     assert [int(text.data) for _, text in heard] == list(range(first, 60))
-    # At four times the pace, but where a busy machine made somebody wait.
-    assert gap([sent for sent, _ in heard]) < 0.6 * gap(times[first:])
+    # At four times the pace.
+    assert heard[-1][0] - heard[0][0] < 0.6 * (times[-1] - times[first])
 
 
 def test_a_recording_is_split_by_size_and_the_files_are_one_bag(start, operator: Operator, tmp_path: pathlib.Path) -> None:
@@ -225,7 +219,7 @@ def test_the_clock_of_a_play_is_that_of_the_bag_at_its_rate(start, operator: Ope
     operator.until(lambda: play.exit_code is not None, "end of the play", 60.0)
     assert play.exit_code == 0, play.log()
     values = [value for _, value in times]
-    assert len(values) > 5
+    assert len(values) > 20
     assert values == sorted(values)
     # The bag begins at second 1.
     assert 3.0 <= values[0] < 3.5

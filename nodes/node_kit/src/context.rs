@@ -69,7 +69,7 @@ impl Network {
     pub fn unused() -> Result<Self, ContextError> {
         static CALLS: AtomicU16 = AtomicU16::new(0);
         let call = CALLS.fetch_add(1, Ordering::Relaxed) % LAST_DOMAIN_ID;
-        // Processes of today that ask at the same time begin elsewhere.
+        // Processes that ask at the same time begin elsewhere.
         let start = (process::id() % u32::from(LAST_DOMAIN_ID)) as u16 + 7 * call;
         let free = |port| UdpSocket::bind((Ipv4Addr::UNSPECIFIED, port)).is_ok();
         let domain_id = (0..LAST_DOMAIN_ID)

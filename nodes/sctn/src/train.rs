@@ -7,6 +7,7 @@ use anyhow::{Context, Result, bail};
 use bags::Demonstration;
 use clap::Args;
 use gctn::{ModelCard, Policy};
+use indicatif::HumanDuration;
 use sctn::{DataSet, EventFile, Recipe, Training, evaluate, recorded_run};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
@@ -173,10 +174,10 @@ pub fn train(
         // Where there is no terminal to draw a bar on, a line now and then.
         if bar.is_hidden() && training.step().is_multiple_of(LOG_EVERY) {
             tracing::info!(
-                "step {}: {}, {:?} left",
+                "step {}: {}, {} left",
                 training.step(),
                 bar.message(),
-                bar.eta()
+                HumanDuration(bar.eta())
             );
         }
         if training.is_snapshot_due() {

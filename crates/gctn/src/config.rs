@@ -359,7 +359,7 @@ pub enum Precision {
     /// 32-bit floats.
     #[default]
     F32,
-    /// Brain floats of 16 bits.
+    /// Brain floats of 16 bits; f32 on a processor without instructions for them: [`Precision::on`].
     Bf16,
 }
 

@@ -58,6 +58,7 @@ impl Policy {
     /// Loads a checkpoint. Refuses another version, missing, further or misshapen tensors, numbers that
     /// are not finite and truncated files.
     pub fn load_for(path: &Path, device: Device, precision: Precision) -> Result<Self, Error> {
+        let precision = precision.on(device);
         let device = device.open()?;
         let (file, config, card) = checkpoint::open(path)?;
         let model = Model::new(&config, Builder::empty(device), precision);

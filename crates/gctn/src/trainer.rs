@@ -47,7 +47,7 @@ impl Trainer {
         let model = Model::new(
             network,
             Builder::random(training.seed, device),
-            training.precision,
+            training.precision.on(training.device),
         );
         let weights = model.parameters.require_gradients();
         let optimiser = AdamW::new(&model.parameters.flat);
@@ -217,7 +217,7 @@ impl Trainer {
     /// A policy with a copy of the present weights.
     pub fn policy(&self) -> Result<Policy, Error> {
         let builder = Builder::empty(self.device);
-        let model = Model::new(&self.model.config, builder, self.config.precision);
+        let model = Model::new(&self.model.config, builder, self.model.precision);
         tch::no_grad(|| {
             let mut flat = model.parameters.flat.shallow_clone();
             flat.f_copy_(&self.model.parameters.flat)

@@ -3,8 +3,8 @@
 mod toy;
 
 use gctn::{
-    Augmentation, Compact, Decision, Network, NetworkConfig, PlaceLoss, Resnet43, Sample, Storage,
-    Trainer, TrainingConfig,
+    Augmentation, Compact, Decision, Device, Network, NetworkConfig, PlaceLoss, Precision,
+    Resnet43, Sample, Storage, Trainer, TrainingConfig,
 };
 use heightmap::{Heightmap, Workspace};
 use nalgebra::{Isometry2, Vector2};
@@ -132,6 +132,28 @@ fn short(seed: u64) -> TrainingConfig {
             ..Augmentation::default()
         },
         ..TrainingConfig::compact()
+    }
+}
+
+/// On a processor without bf16 the same bits, on another one other bits of about the same numbers.
+#[test]
+fn bf16_rounds_only_where_the_processor_computes_in_it() {
+    let computed = Precision::Bf16.on(Device::Cpu);
+    for network in [small_compact(), small_resnet43()] {
+        let [f32, bf16] = [Precision::F32, Precision::Bf16].map(|precision| {
+            let training = TrainingConfig {
+                precision,
+                ..short(0)
+            };
+            let mut trainer = Trainer::new(&network, &training).unwrap();
+            let (observation, goal) = (heightmap(1), heightmap(2));
+            let samples = vec![sample(&observation, &goal); training.batch];
+            trainer.train_step(&samples).unwrap();
+            let losses = trainer.losses(&samples).unwrap();
+            losses.pick + losses.place
+        });
+        assert_eq!(f32 == bf16, computed == Precision::F32, "{f32}, {bf16}");
+        assert!((f32 - bf16).abs() < 0.05 * f32, "{f32}, {bf16}");
     }
 }
 

@@ -7,7 +7,7 @@ use anyhow::{Context, Result, bail};
 use clap::Args;
 use cpu_time::ThreadTime;
 use criterion::Criterion;
-use gctn::{NetworkConfig, Policy, Precision, Trainer, TrainingConfig};
+use gctn::{Device, NetworkConfig, Policy, Precision, Trainer, TrainingConfig};
 use heightmap::{Fusion, Heightmap, View, Workspace};
 use multiravens::{Environment, Problem};
 use rand::SeedableRng;
@@ -176,6 +176,12 @@ impl Bench {
         }
         if self.demonstrations == 0 {
             bail!("--demonstrations: expected at least one");
+        }
+        let computed = Precision::Bf16.on(Device::Cpu);
+        if computed != Precision::Bf16 {
+            tracing::warn!(
+                "this processor has no instructions for bf16: it is measured in {computed}"
+            );
         }
         let output = tempfile::tempdir().context("folder for criterion's files")?;
         let mut figures = BTreeMap::new();

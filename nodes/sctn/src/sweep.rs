@@ -6,7 +6,7 @@ use crate::train::{Snapshot, train};
 use anyhow::{Context, Result};
 use clap::Args;
 use cpu_time::ProcessTime;
-use gctn::Policy;
+use gctn::{Device, Policy, TrainingConfig};
 use sctn::{Recipe, Run, RunResult, Score, SnapshotResult, Sweep, evaluate, wilson_95};
 use std::path::{Path, PathBuf};
 
@@ -139,10 +139,10 @@ impl SweepCommand {
             agent: run.agent,
             demonstrations: run.demonstrations,
             seed: run.seed,
-            recipe,
             test: sweep.test.clone(),
             cpu_seconds: started.elapsed().as_secs_f64(),
-            device: device(),
+            device: device(&recipe.training),
+            recipe,
             snapshots: results,
         })
     }
@@ -167,8 +167,17 @@ fn line(result: &RunResult) -> String {
     )
 }
 
-/// The processor's name, for people.
-fn device() -> String {
+/// What a training computed on and in, for people.
+fn device(training: &TrainingConfig) -> String {
+    let precision = training.precision.on(training.device);
+    match training.device {
+        Device::Cpu => format!("{}, {precision}", processor()),
+        Device::Cuda => format!("a CUDA card beside {}, {precision}", processor()),
+    }
+}
+
+/// The processor's name.
+fn processor() -> String {
     let info = std::fs::read_to_string("/proc/cpuinfo").unwrap_or_default();
     let name = info
         .lines()

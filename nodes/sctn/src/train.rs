@@ -139,6 +139,11 @@ pub fn train(
     let data = load(demos, &mut recipe)?;
     tracing::info!("{} demonstrations, {} steps", data.len(), data.step_count());
     gctn::set_threads(recipe.training.threads);
+    let asked = recipe.training.precision;
+    let precision = asked.on(recipe.training.device);
+    if precision != asked {
+        tracing::warn!("this processor has no instructions for {asked}: training in {precision}");
+    }
     let mut training = Training::open(recipe, data, out, resume)?;
     let log = out.join("snapshots.jsonl");
     let mut snapshots = read_log(&log, training.step())?;

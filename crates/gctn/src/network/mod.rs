@@ -78,8 +78,8 @@ pub(crate) struct Model {
     pub config: NetworkConfig,
     pub parameters: Parameters,
     pub grid: Grid,
+    pub precision: Precision,
     encoding: Encoding,
-    precision: Precision,
     nets: Nets,
 }
 

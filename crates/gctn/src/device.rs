@@ -23,7 +23,7 @@ impl Device {
 
 impl Precision {
     /// What `device` computes in where this is asked for. On a processor without instructions for bf16 that is f32:
-    /// there libtorch would emulate bf16, at an eighth of the speed of f32 (`sctn bench training_sample_compact`).
+    /// there libtorch would emulate bf16, at an eighth of the speed of f32.
     pub fn on(self, device: Device) -> Self {
         match (self, device) {
             (Self::Bf16, Device::Cpu) if !processor_has_bf16() => Self::F32,

@@ -45,8 +45,13 @@ def contents(bag: pathlib.Path, *topics: str) -> list[tuple[str, object]]:
 
 
 def wait_for_recorder(operator: Operator, *publishers) -> None:
-    """Until each of them has a subscription."""
-    operator.until(lambda: all(p.get_subscription_count() >= 1 for p in publishers), "recorder that listens", 60.0)
+    """Until each of them has a subscription beside the operator's own."""
+
+    def own(publisher) -> int:
+        subscriptions = operator.node.get_subscriptions_info_by_topic(publisher.topic_name)
+        return sum(subscription.node_name == operator.node.get_name() for subscription in subscriptions)
+
+    operator.until(lambda: all(p.get_subscription_count() > own(p) for p in publishers), "recorder that listens", 60.0)
 
 
 def wait_until_heard(*publishers) -> None:

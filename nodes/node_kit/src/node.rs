@@ -95,6 +95,28 @@ impl Scope {
     }
 }
 
+/// How often a conflict is looked at, once every [`diagnostics::PERIOD`], before it is told without the other node's name, which comes
+/// later than its endpoints: where its sample was lost, with the writer's next heartbeat (3 s in Fast DDS).
+const LOOKS_FOR_A_NAME: u64 = 8;
+
+/// How long a conflict has been there, and whether it has been told.
+#[derive(Clone, Copy, Debug, Default)]
+struct Sighting {
+    looks: u64,
+    told: bool,
+}
+
+impl Sighting {
+    /// After one more look, with the other node's name known or not.
+    fn after_look(self, named: bool) -> Self {
+        let looks = self.looks + 1;
+        Self {
+            looks,
+            told: self.told || looks > LOOKS_FOR_A_NAME || named && looks > 1,
+        }
+    }
+}
+
 struct Inner {
     ros: Mutex<ros2_client::Node>,
     context: ros2_client::Context,
@@ -117,7 +139,7 @@ impl Inner {
         &self,
         graph: &Graph,
         names: &NodeNames,
-        known: &mut Vec<(Conflict, bool)>,
+        known: &mut Vec<(Conflict, Sighting)>,
     ) {
         let topics = self.statistics();
         let in_use = topics.iter().filter(|topic| topic.in_use());
@@ -129,13 +151,13 @@ impl Inner {
             let name = names.of(conflict.remote);
             let text = conflict.describe(&self.full_name, name.as_deref());
             let before = known.iter().find(|(before, _)| *before == conflict);
-            // The name of the other node comes later than its endpoints.
-            let due = before.is_some_and(|(_, warned)| !warned);
-            if due {
+            let before = before.map_or(Sighting::default(), |(_, sighting)| *sighting);
+            let now = before.after_look(name.is_some());
+            if now.told && !before.told {
                 warn!("{text}");
             }
             first.get_or_insert(text);
-            conflicts.push((conflict, before.is_some()));
+            conflicts.push((conflict, now));
         }
         match first {
             Some(first) => self.diagnostics.set(
@@ -681,5 +703,31 @@ impl Node {
             }
         });
         Ok(())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// The looks after which a conflict is told, when the other node's name is known from that one on.
+    fn told_after(named_from: u64) -> Vec<u64> {
+        let mut sighting = Sighting::default();
+        let mut told = Vec::new();
+        for look in 1..=20 {
+            let now = sighting.after_look(look >= named_from);
+            if now.told && !sighting.told {
+                told.push(look);
+            }
+            sighting = now;
+        }
+        told
+    }
+
+    #[test]
+    fn a_conflict_waits_for_the_other_nodes_name_and_is_told_once_in_any_case() {
+        assert_eq!(told_after(1), [2]);
+        assert_eq!(told_after(5), [5]);
+        assert_eq!(told_after(100), [LOOKS_FOR_A_NAME + 1]);
     }
 }

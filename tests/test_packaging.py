@@ -17,15 +17,15 @@ from catkin_pkg.packages import find_packages
 
 from processes import BINARIES, REPOSITORY
 
-SCTN = REPOSITORY / "nodes/sctn"
+PACKAGE = REPOSITORY / "nodes"
 NODES = ["camera_fusion", "gctn_policy", "goal_oracle", "sim_workcell", "suction_executor"]
-LAUNCH_FILES = sorted((SCTN / "launch").glob("*.launch.py"))
+LAUNCH_FILES = sorted((PACKAGE / "launch").glob("*.launch.py"))
 
 
 def test_a_workspace_finds_both_packages_and_each_is_valid() -> None:
     warnings: list[str] = []
     packages = find_packages(REPOSITORY, exclude_paths=["target", "out"], warnings=warnings)
-    assert {package.name: path for path, package in packages.items()} == {"sctn_msgs": "msgs", "sctn": "nodes/sctn"}
+    assert {package.name: path for path, package in packages.items()} == {"sctn_msgs": "msgs", "sctn_nodes": "nodes"}
     for package in packages.values():
         assert package.package_format == 3
         package.validate(warnings=warnings)
@@ -37,7 +37,7 @@ def test_the_package_installs_every_executable_parameter_and_launch_file(tmp_pat
     build, prefix = tmp_path / "build", tmp_path / "install"
     configure = [
         "import cmake; cmake.cmake()",
-        *("-S", SCTN, "-B", build, "-G", "Ninja", f"-DCMAKE_INSTALL_PREFIX={prefix}", f"-DSCTN_EXECUTABLES={BINARIES}"),
+        *("-S", PACKAGE, "-B", build, "-G", "Ninja", f"-DCMAKE_INSTALL_PREFIX={prefix}", f"-DSCTN_EXECUTABLES={BINARIES}"),
         *("-DBUILD_TESTING=OFF", "-DPython3_FIND_VIRTUALENV=ONLY"),
     ]
     install = ["import cmake; cmake.cmake()", "--build", build, "--target", "install"]
@@ -49,13 +49,13 @@ def test_the_package_installs_every_executable_parameter_and_launch_file(tmp_pat
         done = subprocess.run(command, capture_output=True, text=True, env=environment)
         assert done.returncode == 0, done.stdout + done.stderr
     for executable in (*NODES, "sctn"):
-        assert (prefix / "lib/sctn" / executable).is_file()
-    share = prefix / "share/sctn"
+        assert (prefix / "lib/sctn_nodes" / executable).is_file()
+    share = prefix / "share/sctn_nodes"
     installed = ["package.xml", "config/camera_fusion.yaml", "config/fastdds.xml", "urdf/workcell.urdf", "config/problems/placing.yaml"]
     for path in installed + [f"launch/{file.name}" for file in LAUNCH_FILES]:
         assert (share / path).is_file(), path
     # The installed command finds its files beside itself.
-    shown = subprocess.run([prefix / "lib/sctn/sctn", "bench", "no_such_benchmark"], capture_output=True, text=True, cwd=tmp_path)
+    shown = subprocess.run([prefix / "lib/sctn_nodes/sctn", "bench", "no_such_benchmark"], capture_output=True, text=True, cwd=tmp_path)
     assert "no benchmark of that name" in shown.stderr, shown.stderr
 
 
@@ -118,7 +118,7 @@ def kind(value: object) -> str:
 def shared_path(path: Recorded) -> pathlib.Path:
     """A path below the share folder of the package, where the repository has it."""
     share, *names = path.values[0]
-    assert share.values == ("sctn",)
+    assert share.values == ("sctn_nodes",)
     return REPOSITORY.joinpath(*names)
 
 
@@ -135,7 +135,7 @@ def test_what_a_launch_file_names_is_there(launch_modules, file: pathlib.Path) -
     for part in parts(entities):
         if kind(part) == "PathJoinSubstitution":
             assert shared_path(part).exists(), shared_path(part)
-    ours = [entity.named for entity in entities if kind(entity) == "Node" and entity.named["package"] == "sctn"]
+    ours = [entity.named for entity in entities if kind(entity) == "Node" and entity.named["package"] == "sctn_nodes"]
     names = {node["executable"] for node in ours}
     assert names == set(NODES) - (set() if "simulated" in file.name else {"sim_workcell"})
     for node in ours:
@@ -144,8 +144,8 @@ def test_what_a_launch_file_names_is_there(launch_modules, file: pathlib.Path) -
         known = parameters_of(node["executable"])
         assert set(given) <= set(known), node["executable"]
         assert given["use_sim_time"] is ("simulated" in file.name)
-    foreign = {entity.named["package"] for entity in entities if kind(entity) == "Node"} - {"sctn"}
-    depends = re.findall(r"<exec_depend>(.*)</exec_depend>", (SCTN / "package.xml").read_text())
+    foreign = {entity.named["package"] for entity in entities if kind(entity) == "Node"} - {"sctn_nodes"}
+    depends = re.findall(r"<exec_depend>(.*)</exec_depend>", (PACKAGE / "package.xml").read_text())
     assert foreign <= set(depends)
 
 

@@ -48,7 +48,7 @@ def peer(domain: int) -> Iterator[Peer]:
 
 @pytest.fixture(scope="module")
 def echo(start_for_module, peer: Peer) -> Process:
-    """The node that gives everything back (nodes/node_kit/src/bin/interface_echo.rs)."""
+    """The node that gives everything back (ros/node_kit/src/bin/interface_echo.rs)."""
     process = start_for_module("interface_echo")
     wait_for_node(peer, "interface_echo")
     return process

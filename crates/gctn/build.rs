@@ -1,9 +1,9 @@
 //! Lets the tests, benches and examples of this package find libtorch where torch-sys found it, with
-//! nothing exported. Cargo hands link arguments only to the package that prints them, so every package
-//! that makes an executable with tch in it has a copy of this file and depends on torch-sys directly.
+//! nothing exported. Cargo applies link arguments only to the package that prints them, so every package
+//! that makes an executable with tch in it names this file as its build script and depends on torch-sys directly.
 
 fn main() {
-    println!("cargo::rerun-if-changed=build.rs");
+    println!("cargo::rerun-if-env-changed=DEP_TCH_LIBTORCH_LIB");
     if let Ok(libraries) = std::env::var("DEP_TCH_LIBTORCH_LIB") {
         println!("cargo::rustc-link-arg=-Wl,-rpath,{libraries}");
     }

@@ -1,0 +1,493 @@
+//! `sctn bench`: the inner loops, timed by criterion, and what demonstrations cost.
+
+use crate::demos::demonstration;
+use crate::latency::Chain;
+use crate::root::Root;
+use anyhow::{Context, Result, bail};
+use clap::Args;
+use cpu_time::ThreadTime;
+use criterion::Criterion;
+use gctn::{Device, NetworkConfig, Policy, Precision, Trainer, TrainingConfig};
+use heightmap::{Fusion, Heightmap, View, Workspace};
+use multiravens::{Environment, Problem};
+use rand::SeedableRng;
+use rand_chacha::ChaCha8Rng;
+use learning::{DataSet, Sampling, demonstrate};
+use serde::Serialize;
+use std::collections::BTreeMap;
+use std::hint::black_box;
+use std::path::Path;
+use std::time::Duration;
+
+/// Arguments of `sctn bench`.
+#[derive(Args)]
+pub struct Bench {
+    /// Only benchmarks whose name contains this; those of problems are called demonstration_PROBLEM. `idle`: what the graph
+    /// costs while it waits for an operator. `camera_stream`: three cameras at 30 Hz into camera_fusion
+    name: Option<String>,
+    /// Demonstrations of each problem
+    #[arg(long, default_value_t = 10)]
+    demonstrations: u64,
+    /// Seconds of `camera_stream`
+    #[arg(long, default_value_t = 60.0)]
+    seconds: f64,
+    /// Print a JSON object last
+    #[arg(long)]
+    json: bool,
+}
+
+/// A benchmark: what to run, and what to compare it with.
+struct Workload {
+    name: &'static str,
+    /// Threads that it uses.
+    threads: usize,
+    /// The same work in the original (PyBullet, numpy, TensorFlow), where it was measured.
+    original_s: Option<f64>,
+    /// Iterations measured, at least.
+    samples: usize,
+    run: fn(&Root, &mut Criterion, &str) -> Result<()>,
+}
+
+const SEED: u64 = 10_000;
+
+const WORKLOADS: &[Workload] = &[
+    Workload {
+        name: "fusion",
+        threads: 1,
+        original_s: Some(0.176),
+        samples: 50,
+        run: fusion,
+    },
+    Workload {
+        name: "rendering",
+        threads: 1,
+        original_s: Some(0.766),
+        samples: 50,
+        run: rendering,
+    },
+    Workload {
+        name: "inverse_kinematics",
+        threads: 1,
+        original_s: None,
+        samples: 50,
+        run: inverse_kinematics,
+    },
+    Workload {
+        name: "physics_step",
+        threads: 1,
+        original_s: Some(1.0 / 6870.0),
+        samples: 20,
+        run: physics_step,
+    },
+    Workload {
+        name: "decision_compact",
+        threads: 1,
+        original_s: Some(5.26),
+        samples: 20,
+        run: decision_compact,
+    },
+    Workload {
+        name: "decision_resnet43",
+        threads: 2,
+        original_s: Some(5.26),
+        samples: 10,
+        run: decision_resnet43,
+    },
+    Workload {
+        name: "decision_resnet43_bf16",
+        threads: 2,
+        original_s: Some(5.26),
+        samples: 10,
+        run: decision_resnet43_bf16,
+    },
+    Workload {
+        name: "training_sample_compact",
+        threads: 1,
+        original_s: Some(27.4),
+        samples: 20,
+        run: training_sample_compact,
+    },
+    Workload {
+        name: "training_step_resnet43",
+        threads: 2,
+        original_s: Some(27.4),
+        samples: 10,
+        run: training_step_resnet43,
+    },
+    Workload {
+        name: "frame_to_proposal",
+        threads: 1,
+        original_s: None,
+        samples: 10,
+        run: frame_to_proposal,
+    },
+];
+
+#[derive(Serialize)]
+struct Figure {
+    median_s: f64,
+    threads: usize,
+    original_s: Option<f64>,
+}
+
+/// Reset and one demonstration in the original (PyBullet), where it was measured.
+const ORIGINAL_DEMONSTRATIONS_S: [(&str, f64); 3] =
+    [("stacking", 16.0), ("routing", 13.9), ("chaining", 41.0)];
+
+/// What demonstrations of a problem cost with reset, rendering and fusion, on one thread.
+#[derive(Serialize)]
+struct Cost {
+    episodes: u64,
+    successes: u64,
+    /// Processor time of all episodes, by successful ones.
+    cpu_s: f64,
+    /// Wall time of 1,000 successful ones on two cores, at that.
+    thousand_on_two_cores_s: f64,
+    original_s: Option<f64>,
+}
+
+#[derive(Serialize)]
+struct Report {
+    inner_loops: BTreeMap<&'static str, Figure>,
+    demonstrations: BTreeMap<String, Cost>,
+}
+
+impl Bench {
+    pub fn run(self, root: &Root) -> Result<()> {
+        if self.name.as_deref() == Some("idle") {
+            return crate::idle::run(self.json);
+        }
+        if self.name.as_deref() == Some("camera_stream") {
+            return self.camera_stream(root);
+        }
+        let wanted = |name: &str| self.name.as_ref().is_none_or(|part| name.contains(part));
+        let chosen: Vec<_> = WORKLOADS.iter().filter(|w| wanted(w.name)).collect();
+        let problems = root.join("config/problems");
+        let problems = Problem::names(&problems).with_context(|| problems.display().to_string())?;
+        let benchmark = |problem: &String| format!("demonstration_{problem}");
+        let shown = problems
+            .iter()
+            .filter(|problem| wanted(&benchmark(problem)));
+        let shown: Vec<_> = shown.collect();
+        if chosen.is_empty() && shown.is_empty() {
+            let names = WORKLOADS.iter().map(|workload| workload.name.to_owned());
+            let names: Vec<_> = names.chain(problems.iter().map(benchmark)).collect();
+            bail!("no benchmark of that name; there are: {}", names.join(", "));
+        }
+        if self.demonstrations == 0 {
+            bail!("--demonstrations: expected at least one");
+        }
+        let computed = Precision::Bf16.on(Device::Cpu);
+        if computed != Precision::Bf16 {
+            tracing::warn!(
+                "this processor has no instructions for bf16: it is measured in {computed}"
+            );
+        }
+        let output = tempfile::tempdir().context("folder for criterion's files")?;
+        let mut figures = BTreeMap::new();
+        for workload in chosen {
+            gctn::set_threads(workload.threads);
+            let mut criterion = Criterion::default()
+                .output_directory(output.path())
+                .without_plots()
+                .sample_size(workload.samples)
+                .warm_up_time(Duration::from_secs(1))
+                .measurement_time(Duration::from_secs(3));
+            (workload.run)(root, &mut criterion, workload.name)?;
+            let median_s = median_s(output.path(), workload.name)?;
+            let Workload {
+                threads,
+                original_s,
+                ..
+            } = *workload;
+            figures.insert(
+                workload.name,
+                Figure {
+                    median_s,
+                    threads,
+                    original_s,
+                },
+            );
+        }
+        let costs = shown.into_iter().map(|problem| {
+            let cost = Cost::measure(root, problem, self.demonstrations);
+            cost.map(|cost| (problem.clone(), cost))
+        });
+        let report = Report {
+            inner_loops: figures,
+            demonstrations: costs.collect::<Result<_>>()?,
+        };
+        if self.json {
+            println!("{}", serde_json::to_string(&report)?);
+        } else {
+            report.print();
+        }
+        Ok(())
+    }
+}
+
+impl Cost {
+    fn measure(root: &Root, problem: &str, episodes: u64) -> Result<Self> {
+        let mut environment = Environment::new(&root.problem(problem)?, &root.work_cell()?);
+        let mut successes = 0;
+        let started = ThreadTime::now();
+        for index in 0..episodes {
+            let rollout = demonstrate(&mut environment, SEED + 2 * index)?;
+            successes += u64::from(rollout.complete);
+        }
+        if successes == 0 {
+            bail!("no demonstration of {problem} succeeded");
+        }
+        let cpu_s = started.elapsed().as_secs_f64() / successes as f64;
+        let original = ORIGINAL_DEMONSTRATIONS_S
+            .iter()
+            .find(|(name, _)| *name == problem);
+        Ok(Self {
+            episodes,
+            successes,
+            cpu_s,
+            thousand_on_two_cores_s: 1000.0 * cpu_s / 2.0,
+            original_s: original.map(|(_, seconds)| *seconds),
+        })
+    }
+}
+
+impl Report {
+    /// The originals ran on another machine: no ratio is claimed.
+    fn print(&self) {
+        let original = |seconds: Option<f64>| seconds.map_or_else(|| "-".to_owned(), time);
+        if !self.inner_loops.is_empty() {
+            println!(
+                "{:26} {:>10} {:>8} {:>10}",
+                "inner loop", "median", "threads", "original"
+            );
+        }
+        for (name, figure) in &self.inner_loops {
+            let (median, original) = (time(figure.median_s), original(figure.original_s));
+            println!(
+                "{name:26} {median:>10} {:>8} {original:>10}",
+                figure.threads
+            );
+        }
+        if !self.demonstrations.is_empty() {
+            println!(
+                "{:26} {:>10} {:>8} {:>10} {:>17}",
+                "demonstration", "CPU time", "success", "original", "1,000 on 2 cores"
+            );
+        }
+        for (name, cost) in &self.demonstrations {
+            println!(
+                "{name:26} {:>10} {:>8} {:>10} {:>13.1} min",
+                time(cost.cpu_s),
+                format!("{}/{}", cost.successes, cost.episodes),
+                original(cost.original_s),
+                cost.thousand_on_two_cores_s / 60.0
+            );
+        }
+    }
+}
+
+impl Bench {
+    /// Fails where an image was lost.
+    fn camera_stream(&self, root: &Root) -> Result<()> {
+        if !(self.seconds.is_finite() && self.seconds > 0.0) {
+            bail!("--seconds {}: expected a positive number", self.seconds);
+        }
+        let figures = crate::camera_stream::measure(root, self.seconds)?;
+        if self.json {
+            println!("{}", serde_json::json!({"camera_stream": figures}));
+        } else {
+            println!(
+                "three cameras, colour of 1.04 MB and depth of 0.69 MB at 30 Hz, {} s, {:.0} MB/s: {} sets, {} heightmaps, {} images \
+                 lost",
+                figures.seconds,
+                figures.mb_s,
+                figures.sets,
+                figures.heightmaps,
+                figures.images_lost
+            );
+            println!(
+                "camera_fusion: {:.2} cores; last image sent to heightmap received: median {}, 99 % {}, at most {}",
+                figures.fusion_cores,
+                time(figures.latency_median_s),
+                time(figures.latency_p99_s),
+                time(figures.latency_max_s)
+            );
+        }
+        if figures.images_lost > 0 || figures.heightmaps < figures.sets {
+            bail!(
+                "{} images lost, {} of {} heightmaps",
+                figures.images_lost,
+                figures.heightmaps,
+                figures.sets
+            );
+        }
+        Ok(())
+    }
+}
+
+/// A time for people.
+fn time(seconds: f64) -> String {
+    match seconds {
+        s if s < 1e-3 => format!("{:.2} us", 1e6 * s),
+        s if s < 1.0 => format!("{:.2} ms", 1e3 * s),
+        s => format!("{s:.2} s"),
+    }
+}
+
+/// The median that criterion has written.
+fn median_s(directory: &Path, name: &str) -> Result<f64> {
+    let path = directory.join(name).join("new/estimates.json");
+    let text = std::fs::read_to_string(&path).with_context(|| path.display().to_string())?;
+    let estimates: serde_json::Value = serde_json::from_str(&text)?;
+    let nanoseconds = estimates["median"]["point_estimate"].as_f64();
+    Ok(nanoseconds.context("criterion's estimates have no median")? * 1e-9)
+}
+
+fn environment(root: &Root) -> Result<Environment> {
+    let mut environment = Environment::new(&root.problem("placing")?, &root.work_cell()?);
+    environment.reset(SEED)?;
+    Ok(environment)
+}
+
+fn fusion(root: &Root, criterion: &mut Criterion, name: &str) -> Result<()> {
+    let mut environment = environment(root)?;
+    environment.observe()?;
+    let views: Vec<View<'_>> = environment.cell().views().collect();
+    let (mut fusion, mut out) = (Fusion::default(), Heightmap::new(Workspace::RAVENS));
+    criterion.bench_function(name, |b| {
+        b.iter(|| fusion.fuse(black_box(&views), &mut out))
+    });
+    Ok(())
+}
+
+fn rendering(root: &Root, criterion: &mut Criterion, name: &str) -> Result<()> {
+    let mut environment = environment(root)?;
+    criterion.bench_function(name, |b| b.iter(|| environment.cell_mut().render().is_ok()));
+    Ok(())
+}
+
+fn inverse_kinematics(root: &Root, criterion: &mut Criterion, name: &str) -> Result<()> {
+    let arm = root.work_cell()?.arm;
+    let near = arm.home + ur5::Joints::repeat(0.1);
+    let tip = arm.tip(&near);
+    arm.solve(&tip, &arm.home)?;
+    criterion.bench_function(name, |b| b.iter(|| arm.solve(black_box(&tip), &arm.home)));
+    Ok(())
+}
+
+fn physics_step(root: &Root, criterion: &mut Criterion, name: &str) -> Result<()> {
+    let mut environment = environment(root)?;
+    let arm = root.work_cell()?.arm;
+    let tip = arm.tip(&arm.home);
+    let world = environment.cell_mut().world_mut();
+    criterion.bench_function(name, |b| b.iter(|| world.step(&tip)));
+    Ok(())
+}
+
+fn decision_compact(root: &Root, criterion: &mut Criterion, name: &str) -> Result<()> {
+    decision(
+        root,
+        criterion,
+        name,
+        &Policy::load(&root.shipped_checkpoint())?,
+    )
+}
+
+fn decision_resnet43(root: &Root, criterion: &mut Criterion, name: &str) -> Result<()> {
+    decision(root, criterion, name, &resnet43(Precision::F32)?.policy()?)
+}
+
+fn decision_resnet43_bf16(root: &Root, criterion: &mut Criterion, name: &str) -> Result<()> {
+    decision(root, criterion, name, &resnet43(Precision::Bf16)?.policy()?)
+}
+
+/// Random weights cost as much as trained ones.
+fn resnet43(precision: Precision) -> Result<Trainer> {
+    let training = TrainingConfig {
+        threads: 2,
+        precision,
+        ..TrainingConfig::published()
+    };
+    Ok(Trainer::new(&NetworkConfig::resnet43(), &training)?)
+}
+
+/// Forward, backward and optimiser for one sample, augmented, in bf16 as in `config/recipes/ten_problems.yaml`.
+fn training_sample_compact(root: &Root, criterion: &mut Criterion, name: &str) -> Result<()> {
+    let training = TrainingConfig {
+        batch: 1,
+        precision: Precision::Bf16,
+        ..TrainingConfig::compact()
+    };
+    let trainer = Trainer::new(&NetworkConfig::compact(), &training)?;
+    training_step(root, criterion, name, trainer)
+}
+
+/// As published: one sample a step, over all rotations.
+fn training_step_resnet43(root: &Root, criterion: &mut Criterion, name: &str) -> Result<()> {
+    training_step(root, criterion, name, resnet43(Precision::F32)?)
+}
+
+fn training_step(
+    root: &Root,
+    criterion: &mut Criterion,
+    name: &str,
+    mut trainer: Trainer,
+) -> Result<()> {
+    let mut data = DataSet::default();
+    data.push(demonstration(
+        &root.problem("placing")?,
+        &root.work_cell()?,
+        SEED,
+    )?)?;
+    let mut rng = ChaCha8Rng::seed_from_u64(SEED);
+    let conditioning = trainer.network().conditioning;
+    let sample = data.draw(&Sampling::Plain, conditioning, 0.0, &mut rng)?;
+    trainer.train_step(&[sample])?;
+    let mut failure = None;
+    criterion.bench_function(name, |b| {
+        b.iter(|| {
+            if let Err(error) = trainer.train_step(black_box(&[sample])) {
+                failure = Some(error);
+            }
+        })
+    });
+    failure.map_or(Ok(()), |error| Err(error.into()))
+}
+
+fn decision(root: &Root, criterion: &mut Criterion, name: &str, policy: &Policy) -> Result<()> {
+    let shown = demonstration(&root.problem("placing")?, &root.work_cell()?, SEED)?;
+    let goal = shown
+        .goals()
+        .into_iter()
+        .next()
+        .context("a demonstration without goals")?;
+    let observation = &shown
+        .steps
+        .first()
+        .context("a demonstration without steps")?
+        .observation;
+    policy.decide(observation, goal, &[])?;
+    criterion.bench_function(name, |b| {
+        b.iter(|| policy.decide(black_box(observation), goal, &[]))
+    });
+    Ok(())
+}
+
+/// Over DDS, from the last camera frame to the proposal, without what the network takes.
+fn frame_to_proposal(root: &Root, criterion: &mut Criterion, name: &str) -> Result<()> {
+    let mut chain = Chain::start(root, SEED)?;
+    chain.warm_up()?;
+    let mut failure = None;
+    criterion.bench_function(name, |b| {
+        b.iter_custom(|captures| {
+            let times = (0..captures).map(|_| chain.measure());
+            let total: Result<Duration> = times.sum();
+            total.unwrap_or_else(|error| {
+                failure = Some(error);
+                Duration::from_secs(1)
+            })
+        })
+    });
+    failure.map_or(Ok(()), Err)
+}

@@ -1,0 +1,279 @@
+//! `sctn train`.
+
+use crate::evaluate::summary;
+use crate::progress;
+use crate::root::Root;
+use anyhow::{Context, Result, bail};
+use bags::Demonstration;
+use clap::Args;
+use gctn::{ModelCard, Policy};
+use indicatif::HumanDuration;
+use learning::{DataSet, EventFile, Recipe, Training, evaluate, recorded_run};
+use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
+use std::io::Write;
+use std::path::{Path, PathBuf};
+
+/// Gradient steps between lines of progress where there is no terminal.
+const LOG_EVERY: u64 = 50;
+
+/// Gradient steps between scalars for TensorBoard.
+const EVENT_EVERY: u64 = 10;
+
+/// Arguments of `sctn train`.
+#[derive(Args)]
+pub struct Train {
+    /// Recipe
+    #[arg(long)]
+    recipe: PathBuf,
+    /// Folder that `sctn demos` wrote; or recorded runs, each the folder of `sctn launch --record` or a bag: their
+    /// steps that the operator approved and confirmed, as many runs as are given in place of the recipe's number
+    #[arg(long, required = true, num_args = 1..)]
+    demos: Vec<PathBuf>,
+    /// Folder for state, snapshots and the policy
+    #[arg(long)]
+    out: PathBuf,
+    /// Go on with the training in that folder
+    #[arg(long)]
+    resume: bool,
+    /// Print a JSON object last
+    #[arg(long)]
+    json: bool,
+}
+
+/// One snapshot and how it did on validation episodes.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+pub struct Snapshot {
+    pub step: u64,
+    pub checkpoint: PathBuf,
+    /// Mean losses since the snapshot before.
+    pub pick_loss: f64,
+    pub place_loss: f64,
+    /// Completion rate of each problem on validation episodes.
+    pub completion: BTreeMap<String, f64>,
+    /// Mean reward of each problem.
+    pub reward: BTreeMap<String, f64>,
+}
+
+impl Snapshot {
+    /// Better on validation first, then later.
+    fn rank(&self) -> (f64, f64, u64) {
+        let mean = |values: &BTreeMap<String, f64>| {
+            values.values().sum::<f64>() / values.len().max(1) as f64
+        };
+        (mean(&self.completion), mean(&self.reward), self.step)
+    }
+}
+
+impl Train {
+    pub fn run(self, root: &Root) -> Result<()> {
+        let recipe = Recipe::load(&self.recipe)?;
+        let snapshots = train(root, recipe, &self.demos, &self.out, self.resume)?;
+        let best = snapshots.iter().max_by(|a, b| {
+            a.rank()
+                .partial_cmp(&b.rank())
+                .unwrap_or(std::cmp::Ordering::Equal)
+        });
+        let best = best.context("no snapshot was taken")?;
+        let policy = self.out.join("policy.safetensors");
+        std::fs::copy(&best.checkpoint, &policy).with_context(|| policy.display().to_string())?;
+        if self.json {
+            println!(
+                "{}",
+                serde_json::json!({ "policy": policy, "best": best, "snapshots": snapshots })
+            );
+        } else {
+            println!("{}: the snapshot of step {}", policy.display(), best.step);
+        }
+        Ok(())
+    }
+}
+
+/// The demonstrations of one folder that `sctn demos` wrote, or of recorded runs.
+fn load(demos: &[PathBuf], recipe: &mut Recipe) -> Result<DataSet> {
+    let mut data = DataSet::default();
+    let runs: Vec<PathBuf> = demos.iter().filter_map(|path| recorded_run(path)).collect();
+    if runs.is_empty() {
+        let [folder] = demos else {
+            bail!("--demos: expected one folder of demonstrations, or recorded runs only");
+        };
+        for problem in &recipe.problems {
+            data.load(folder, problem, recipe.demonstrations)?;
+        }
+        return Ok(data);
+    }
+    if runs.len() < demos.len() {
+        bail!("--demos: recorded runs and other folders cannot be mixed");
+    }
+    recipe.demonstrations = runs.len();
+    for run in runs {
+        data.load_bag(&run, &recipe.problems)?;
+        if let Some((demonstration, left_out)) = Demonstration::read_run(&run)? {
+            tracing::info!(
+                "{}: {} steps, {} proposals left out",
+                run.display(),
+                demonstration.steps.len(),
+                left_out.len()
+            );
+            for left_out in left_out {
+                tracing::info!(
+                    "  step {}, attempt {}: {}",
+                    left_out.step,
+                    left_out.attempt,
+                    left_out.reason
+                );
+            }
+        }
+    }
+    Ok(data)
+}
+
+/// Trains by a recipe in a folder, or goes on with what the folder holds; gives all snapshots.
+pub fn train(
+    root: &Root,
+    mut recipe: Recipe,
+    demos: &[PathBuf],
+    out: &Path,
+    resume: bool,
+) -> Result<Vec<Snapshot>> {
+    let data = load(demos, &mut recipe)?;
+    tracing::info!("{} demonstrations, {} steps", data.len(), data.step_count());
+    gctn::set_threads(recipe.training.threads);
+    let asked = recipe.training.precision;
+    let precision = asked.on(recipe.training.device);
+    if precision != asked {
+        tracing::warn!("this processor has no instructions for {asked}: training in {precision}");
+    }
+    let mut training = Training::open(recipe, data, out, resume)?;
+    let log = out.join("snapshots.jsonl");
+    let mut snapshots = read_log(&log, training.step())?;
+    let board = out.join("tensorboard");
+    let written = || board.display().to_string();
+    let mut events = EventFile::create(&board).with_context(written)?;
+    let bar = progress::bar(training.recipe().training.steps, "steps");
+    bar.set_position(training.step());
+    let (mut pick, mut place, mut count) = (0.0, 0.0, 0u32);
+    while !training.is_done() {
+        let learning_rate = training.learning_rate();
+        let losses = training.advance()?;
+        pick += losses.pick;
+        place += losses.place;
+        count += 1;
+        bar.inc(1);
+        bar.set_message(format!(
+            "pick loss {:.3}, place loss {:.3}",
+            pick / f64::from(count),
+            place / f64::from(count)
+        ));
+        if training.step().is_multiple_of(EVENT_EVERY) {
+            let scalars = [
+                ("loss/pick", losses.pick),
+                ("loss/place", losses.place),
+                ("gradient_norm", losses.gradient_norm),
+                ("learning_rate", learning_rate),
+            ];
+            events
+                .scalars(training.step(), &scalars)
+                .with_context(written)?;
+        }
+        // Where there is no terminal to draw a bar on, a line now and then.
+        if bar.is_hidden() && training.step().is_multiple_of(LOG_EVERY) {
+            tracing::info!(
+                "step {}: {}, {} left",
+                training.step(),
+                bar.message(),
+                HumanDuration(bar.eta())
+            );
+        }
+        if training.is_snapshot_due() {
+            let checkpoint = training.save_snapshot(&card(&training))?;
+            let mut snapshot = Snapshot {
+                step: training.step(),
+                checkpoint,
+                pick_loss: pick / f64::from(count),
+                place_loss: place / f64::from(count),
+                completion: BTreeMap::new(),
+                reward: BTreeMap::new(),
+            };
+            (pick, place, count) = (0.0, 0.0, 0);
+            bar.suspend(|| validate(root, training.recipe(), &mut snapshot))?;
+            for (problem, completion) in &snapshot.completion {
+                let tag = format!("validation/{problem}");
+                let scalars = [(tag.as_str(), *completion)];
+                events
+                    .scalars(snapshot.step, &scalars)
+                    .with_context(written)?;
+            }
+            append(&log, &snapshot)?;
+            snapshots.push(snapshot);
+        }
+    }
+    bar.finish_and_clear();
+    Ok(snapshots)
+}
+
+/// Says how the checkpoint was made.
+fn card(training: &Training) -> ModelCard {
+    let recipe = training.recipe();
+    ModelCard::from([
+        (
+            "recipe".into(),
+            serde_json::to_string(recipe).unwrap_or_default(),
+        ),
+        ("step".into(), training.step().to_string()),
+        (
+            "trained with".into(),
+            format!("sctn {}", env!("CARGO_PKG_VERSION")),
+        ),
+    ])
+}
+
+/// Lets a snapshot act on the validation episodes of every problem.
+fn validate(root: &Root, recipe: &Recipe, snapshot: &mut Snapshot) -> Result<()> {
+    if recipe.validation.episodes == 0 {
+        return Ok(());
+    }
+    let work_cell = root.work_cell()?;
+    let mut policies: Vec<_> = (0..recipe.training.threads.max(1))
+        .map(|_| Ok(Policy::load(&snapshot.checkpoint)?))
+        .collect::<Result<_>>()?;
+    for name in &recipe.problems {
+        let problem = root.problem(name)?;
+        let report = evaluate(
+            &problem,
+            &work_cell,
+            &mut policies,
+            recipe.validation.seed,
+            recipe.validation.episodes,
+            |_, _| (),
+        )?;
+        tracing::info!("step {}: {}", snapshot.step, summary(&report));
+        snapshot.completion.insert(name.clone(), report.completion);
+        snapshot.reward.insert(name.clone(), report.reward);
+    }
+    Ok(())
+}
+
+/// Snapshots of an earlier run, up to the step that it stopped at.
+fn read_log(path: &Path, step: u64) -> Result<Vec<Snapshot>> {
+    if step == 0 || !path.exists() {
+        return Ok(Vec::new());
+    }
+    let text = std::fs::read_to_string(path).with_context(|| path.display().to_string())?;
+    let snapshots = text.lines().map(|line| {
+        serde_json::from_str::<Snapshot>(line).with_context(|| path.display().to_string())
+    });
+    let mut snapshots = snapshots.collect::<Result<Vec<_>>>()?;
+    snapshots.retain(|snapshot| snapshot.step <= step);
+    Ok(snapshots)
+}
+
+fn append(path: &Path, snapshot: &Snapshot) -> Result<()> {
+    let open = std::fs::OpenOptions::new()
+        .create(true)
+        .append(true)
+        .open(path);
+    let mut file = open.with_context(|| path.display().to_string())?;
+    writeln!(file, "{}", serde_json::to_string(snapshot)?)
+        .with_context(|| path.display().to_string())
+}

@@ -1,0 +1,267 @@
+//! Training recipes: everything that makes a policy, in one YAML file.
+
+use crate::sampling::{Sampling, SamplingError};
+use gctn::{NetworkConfig, TrainingConfig};
+use serde::{Deserialize, Serialize};
+use std::path::{Path, PathBuf};
+
+/// What to train on what, and how.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Recipe {
+    /// Problems whose demonstrations are learned from.
+    pub problems: Vec<String>,
+    /// Demonstrations of each problem.
+    pub demonstrations: usize,
+    /// The network.
+    pub network: NetworkConfig,
+    /// Checkpoint of the same network whose weights the training begins with, instead of random ones; from where the command runs.
+    #[serde(default, skip_serializing_if = "Option::is_none")]
+    pub start_from: Option<PathBuf>,
+    /// How it is trained.
+    pub training: TrainingConfig,
+    /// Which step is drawn how often.
+    #[serde(default)]
+    pub sampling: Sampling,
+    /// Probability that a sample's next-step goal is the one after the next, against calling a step done too
+    /// early.
+    #[serde(default)]
+    pub goal_jitter: f64,
+    /// Number of snapshots, evenly spread over the training.
+    pub snapshots: u64,
+    /// How snapshots are compared.
+    pub validation: Validation,
+}
+
+/// Validation episodes, on seeds that neither training nor test uses.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Validation {
+    /// Episodes of each problem, of every snapshot; 0 keeps the last snapshot.
+    pub episodes: usize,
+    /// Seed of the first episode; odd, and below 10,000.
+    pub seed: u64,
+}
+
+/// A recipe that cannot be used.
+#[derive(Debug, thiserror::Error)]
+pub enum RecipeError {
+    /// The file cannot be read.
+    #[error("{}: {source}", path.display())]
+    Io {
+        /// The file.
+        path: PathBuf,
+        /// Why.
+        source: std::io::Error,
+    },
+    /// Not YAML, an unknown field, or a field of another type.
+    #[error("{}: {source}", path.display())]
+    Yaml {
+        /// The file.
+        path: PathBuf,
+        /// What the parser said, with line and column.
+        source: serde_yaml_ng::Error,
+    },
+    /// A network or training parameter out of range.
+    #[error("{}: {source}", path.display())]
+    Network {
+        /// The file.
+        path: PathBuf,
+        /// Which, and what was expected.
+        source: gctn::Error,
+    },
+    /// A weight out of range.
+    #[error("{}: {source}", path.display())]
+    Sampling {
+        /// The file.
+        path: PathBuf,
+        /// Which, and what was expected.
+        source: SamplingError,
+    },
+    /// A field out of range.
+    #[error("{}: {field} is {value}, expected {expected}", path.display())]
+    Field {
+        /// The file.
+        path: PathBuf,
+        /// Which.
+        field: &'static str,
+        /// Its value.
+        value: String,
+        /// What was expected.
+        expected: &'static str,
+    },
+}
+
+/// Reads a file, without checking ranges.
+pub(crate) fn read_yaml<T: serde::de::DeserializeOwned>(path: &Path) -> Result<T, RecipeError> {
+    let text = std::fs::read_to_string(path).map_err(|source| RecipeError::Io {
+        path: path.to_owned(),
+        source,
+    })?;
+    serde_yaml_ng::from_str(&text).map_err(|source| RecipeError::Yaml {
+        path: path.to_owned(),
+        source,
+    })
+}
+
+/// Refuses a field out of range.
+pub(crate) fn check_field(
+    path: &Path,
+    field: &'static str,
+    good: bool,
+    value: String,
+    expected: &'static str,
+) -> Result<(), RecipeError> {
+    match good {
+        true => Ok(()),
+        false => Err(RecipeError::Field {
+            path: path.to_owned(),
+            field,
+            value,
+            expected,
+        }),
+    }
+}
+
+impl Recipe {
+    /// Reads and checks a recipe.
+    pub fn load(path: &Path) -> Result<Self, RecipeError> {
+        let recipe: Self = read_yaml(path)?;
+        recipe.check(path)?;
+        Ok(recipe)
+    }
+
+    /// Checks all ranges; `path` is what errors name.
+    pub(crate) fn check(&self, path: &Path) -> Result<(), RecipeError> {
+        let recipe = self;
+        let owned = || path.to_owned();
+        let network = |source| RecipeError::Network {
+            path: owned(),
+            source,
+        };
+        recipe.network.check().map_err(network)?;
+        recipe.training.check().map_err(network)?;
+        recipe
+            .sampling
+            .validate()
+            .map_err(|source| RecipeError::Sampling {
+                path: owned(),
+                source,
+            })?;
+        let field = |field, good, value, expected| check_field(path, field, good, value, expected);
+        let Self {
+            problems,
+            demonstrations,
+            goal_jitter,
+            snapshots,
+            validation,
+            ..
+        } = recipe;
+        field(
+            "problems",
+            !problems.is_empty(),
+            format!("{problems:?}"),
+            "at least one",
+        )?;
+        field(
+            "demonstrations",
+            *demonstrations > 0,
+            demonstrations.to_string(),
+            "at least 1",
+        )?;
+        let good = (0.0..=1.0).contains(goal_jitter);
+        field("goal_jitter", good, goal_jitter.to_string(), "0 to 1")?;
+        let good = (1..=recipe.training.steps).contains(snapshots);
+        field(
+            "snapshots",
+            good,
+            snapshots.to_string(),
+            "1 to training.steps",
+        )?;
+        let good = validation.seed % 2 == 1 && validation.seed < 10_000;
+        field(
+            "validation.seed",
+            good,
+            validation.seed.to_string(),
+            "an odd number below 10,000",
+        )
+    }
+
+    /// Steps after which a snapshot is taken, the last step among them.
+    pub fn snapshot_steps(&self) -> impl Iterator<Item = u64> {
+        let (steps, snapshots) = (self.training.steps, self.snapshots);
+        (1..=snapshots).map(move |index| index * steps / snapshots)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn shipped() -> PathBuf {
+        Path::new(env!("CARGO_MANIFEST_DIR")).join("../config/recipes/placing.yaml")
+    }
+
+    fn changed(from: &str, to: &str) -> String {
+        let text = std::fs::read_to_string(shipped()).unwrap();
+        assert!(text.contains(from), "{from}");
+        let folder = tempfile::tempdir().unwrap();
+        let path = folder.path().join("recipe.yaml");
+        std::fs::write(&path, text.replacen(from, to, 1)).unwrap();
+        let error = Recipe::load(&path).unwrap_err().to_string();
+        assert!(error.contains("recipe.yaml"), "{error}");
+        error
+    }
+
+    #[test]
+    fn the_shipped_recipe_loads_and_snapshots_end_with_the_last_step() {
+        let recipe = Recipe::load(&shipped()).unwrap();
+        let steps: Vec<_> = recipe.snapshot_steps().collect();
+        assert_eq!(steps.len() as u64, recipe.snapshots);
+        assert_eq!(steps.last(), Some(&recipe.training.steps));
+    }
+
+    #[test]
+    fn the_recipe_of_all_options_says_what_is_meant_where_nothing_is_said() {
+        let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../config/recipes");
+        let all = Recipe::load(&folder.join("all_options.yaml")).unwrap();
+        let network = NetworkConfig::compact();
+        assert_eq!(all.network, network);
+        assert_eq!(all.training, TrainingConfig::compact());
+        assert_eq!(all.sampling, Sampling::default());
+        assert_eq!(all.goal_jitter, 0.0);
+    }
+
+    #[test]
+    fn every_shipped_recipe_loads() {
+        let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../config/recipes");
+        let mut count = 0;
+        for entry in std::fs::read_dir(folder).unwrap() {
+            let path = entry.unwrap().path();
+            if path.is_file() {
+                Recipe::load(&path).unwrap();
+                count += 1;
+            }
+        }
+        assert!(count >= 2);
+    }
+
+    #[test]
+    fn a_field_that_is_unknown_or_out_of_range_is_refused_by_name() {
+        assert!(changed("snapshots:", "snapshot:").contains("snapshot"));
+        assert!(changed("seed: 1}", "seed: 2}").contains("validation.seed is 2"));
+        assert!(changed("snapshots: 4", "snapshots: 0").contains("snapshots is 0"));
+        assert!(changed("batch: 4", "batch: 0").contains("batch is 0"));
+        assert!(
+            changed("snapshots: 4", "snapshots: 4\ngoal_jitter: 1.5")
+                .contains("goal_jitter is 1.5")
+        );
+        assert!(
+            changed("weighting: plain", "weighting: unif").contains("unif_step"),
+            "the known ones are named"
+        );
+        assert!(
+            changed("demonstrations: 100", "demonstrations: 0").contains("demonstrations is 0")
+        );
+    }
+}

@@ -1,9 +1,9 @@
 //! Learning curves as pictures.
 
 use anyhow::{Context, Result, anyhow};
+use learning::{Cell, Table};
 use plotters::prelude::*;
 use plotters::style::{FontStyle, register_font};
-use learning::{Cell, Table};
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 

@@ -5,9 +5,9 @@ use crate::root::Root;
 use anyhow::{Context, Result};
 use clap::Args;
 use gctn::{EmbeddingTrainer, ModelCard};
+use learning::{DataSet, EmbeddingRecipe};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
-use learning::{DataSet, EmbeddingRecipe};
 use std::path::PathBuf;
 
 /// Gradient steps between lines of progress.

@@ -6,11 +6,11 @@ use anyhow::{Context, Result};
 use clap::Args;
 use gctn::{Embedding, Policy};
 use heightmap::Heightmap;
+use learning::{attempt, known_images, reached, wilson_95};
 use multiravens::Environment;
 use rand::{Rng, RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
 use rand_distr::StandardNormal;
-use learning::{attempt, known_images, reached, wilson_95};
 use serde::Serialize;
 use std::path::PathBuf;
 

@@ -4,9 +4,9 @@ use crate::progress;
 use crate::root::Root;
 use anyhow::{Result, bail};
 use clap::{Args, ValueEnum};
+use learning::wilson_95;
 use multiravens::Environment;
 use multiravens::health::{Blind, Checkup, Extremes, check_up};
-use learning::wilson_95;
 use serde::Serialize;
 use std::collections::BTreeMap;
 

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import pathlib
 
+from cell_operator import Operator
 from rclpy.duration import Duration
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
-
-from cell_operator import Operator
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
 # Many messages in a short time: none may fall out of a reader's history.

@@ -7,13 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 from builtin_interfaces.msg import Time
+from cell_operator import LATCHED, Operator
 from geometry_msgs.msg import Quaternion, Transform, TransformStamped, Vector3
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, Image
 from std_msgs.msg import Header
 from tf2_msgs.msg import TFMessage
-
-from cell_operator import LATCHED, Operator
 
 NAMES = ("front", "left", "right")
 WIDTH, HEIGHT, FOCAL_PX = 640, 480, 450.0

@@ -87,14 +87,10 @@ class Operator:
             self._executor.spin_once(timeout_sec=0.1)
         return found
 
-    def next(
-        self, topic: str, after: int = 0, accept: Callable[[Any], bool] = lambda _: True, timeout_s: float = 120.0
-    ) -> Any:
+    def next(self, topic: str, after: int = 0, accept: Callable[[Any], bool] = lambda _: True, timeout_s: float = 120.0) -> Any:
         """The first message of a topic, from the `after`th on, that is accepted."""
         messages = self.received[topic]
-        return self.until(
-            lambda: next((message for message in messages[after:] if accept(message)), None), f"{topic} message", timeout_s
-        )
+        return self.until(lambda: next((message for message in messages[after:] if accept(message)), None), f"{topic} message", timeout_s)
 
     def count(self, topic: str) -> int:
         """How many messages of a topic have come."""

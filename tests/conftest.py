@@ -7,7 +7,6 @@ import pathlib
 from collections.abc import Callable, Iterator
 
 import pytest
-
 from processes import REPOSITORY, Process, free_domain
 
 # Read by rmw_fastrtps when the first participant is made.
@@ -15,7 +14,7 @@ os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
 os.environ["RMW_IMPLEMENTATION"] = "rmw_fastrtps_cpp"
 os.environ["FASTRTPS_DEFAULT_PROFILES_FILE"] = str(REPOSITORY / "config/fastdds.xml")
 
-from cell_operator import Operator  # noqa: E402
+from cell_operator import Operator
 
 Start = Callable[..., Process]
 
@@ -33,9 +32,7 @@ def start(request: pytest.FixtureRequest, domain: int, tmp_path: pathlib.Path) -
 
 
 @pytest.fixture(scope="module")
-def start_for_module(
-    request: pytest.FixtureRequest, domain: int, tmp_path_factory: pytest.TempPathFactory
-) -> Iterator[Start]:
+def start_for_module(request: pytest.FixtureRequest, domain: int, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Start]:
     """The same for the tests of a module together."""
     yield from _starter(request, domain, tmp_path_factory.mktemp("logs"))
 

@@ -46,9 +46,7 @@ def test_a_broken_checkpoint_is_refused_by_name(start, tmp_path: pathlib.Path, c
     assert "panicked" not in process.errors()
 
 
-@pytest.mark.parametrize(
-    "contents", [b"", b"not a bag", b"\x89MCAP0\r\n" + b"\xff" * 64], ids=["empty", "text", "records_of_nonsense"]
-)
+@pytest.mark.parametrize("contents", [b"", b"not a bag", b"\x89MCAP0\r\n" + b"\xff" * 64], ids=["empty", "text", "records_of_nonsense"])
 def test_a_bag_that_is_not_one_is_refused_by_name(start, tmp_path: pathlib.Path, contents: bytes) -> None:
     file = tmp_path / "broken.mcap"
     file.write_bytes(contents)

@@ -7,9 +7,8 @@ import pathlib
 
 import numpy as np
 import pytest
-from rosbags.highlevel import AnyReader
-
 from bag_contents import KINDS, STORE, writer_of
+from rosbags.highlevel import AnyReader
 
 WHOLE, FAILED, USAGE, DAMAGED = 0, 1, 2, 3
 SCAN = "sensor_msgs/msg/LaserScan"

@@ -7,10 +7,6 @@ import math
 
 import numpy as np
 import pytest
-from diagnostic_msgs.msg import DiagnosticStatus
-from sctn_msgs.msg import Heightmap
-from sensor_msgs.msg import CompressedImage, Image, PointCloud2
-
 from cameras import (
     BOX_COLOUR,
     BOX_HEIGHT_M,
@@ -26,7 +22,10 @@ from cameras import (
     set_depth,
 )
 from cell_operator import LATCHED, Operator, nanoseconds
+from diagnostic_msgs.msg import DiagnosticStatus
 from processes import Process, free_domain
+from sctn_msgs.msg import Heightmap
+from sensor_msgs.msg import CompressedImage, Image, PointCloud2
 
 # Heights come from depths in f32 or whole millimetres.
 TOLERANCE_M = 1e-3
@@ -46,9 +45,7 @@ def cameras(fusion: Process, operator_for_module: Operator) -> Cameras:
     return cameras
 
 
-def fused(
-    operator: Operator, cameras: Cameras, change: Change = lambda _: None, changed: str | None = "left"
-) -> Heightmap:
+def fused(operator: Operator, cameras: Cameras, change: Change = lambda _: None, changed: str | None = "left") -> Heightmap:
     """The heightmap of one set of views; they are sent again until one arrives, as images are best effort."""
     stamps = []
 
@@ -237,9 +234,7 @@ def test_a_bad_view_is_named_and_the_node_lives_on(cameras, operator_for_module,
     assert heights(fused(operator_for_module, cameras)).max() == pytest.approx(BOX_HEIGHT_M, abs=TOLERANCE_M)
 
 
-def test_a_missing_camera_is_named_and_no_heightmap_of_two_views_passes_as_one_of_three(
-    cameras, operator_for_module, fusion
-) -> None:
+def test_a_missing_camera_is_named_and_no_heightmap_of_two_views_passes_as_one_of_three(cameras, operator_for_module, fusion) -> None:
     before = len(fusion.errors())
     stamps = []
 

@@ -6,9 +6,8 @@ import time
 from collections.abc import Callable
 from contextlib import ExitStack
 
-from rclpy.node import Node
-
 from peer import Peer
+from rclpy.node import Node
 
 SCRIPTS = 5
 NODES = 6

@@ -10,14 +10,13 @@ import string
 
 import numpy as np
 import pytest
+from bag_contents import KINDS, same, writer_of
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
+from processes import REPOSITORY
 from rosbags.highlevel import AnyReader
 from rosbags.interfaces import Nodetype
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-
-from bag_contents import KINDS, same, writer_of
-from processes import REPOSITORY
 
 COPIES = 3
 INTEGERS = {f"{sign}int{bits}": np.dtype(f"{sign}int{bits}") for sign in ("", "u") for bits in (8, 16, 32, 64)}
@@ -120,7 +119,9 @@ def check(bag: pathlib.Path, messages: list[tuple[str, bytes]]) -> None:
     """Two readers of others find in a bag of ours what was written, decoded and not."""
     key = functions.itemgetter(0, 1)
     expected = sorted((topic_of(name), padded(raw)) for name, raw in messages)
-    first, second = (sorted(((topic, padded(raw), read) for topic, raw, read in found), key=key) for found in (by_rosbags(bag), by_mcap(bag)))
+    first, second = (
+        sorted(((topic, padded(raw), read) for topic, raw, read in found), key=key) for found in (by_rosbags(bag), by_mcap(bag))
+    )
     assert [found[:2] for found in first] == expected
     assert [found[:2] for found in second] == expected
     for (topic, raw, theirs), (_, _, others) in zip(first, second, strict=True):

@@ -5,9 +5,8 @@ from __future__ import annotations
 import json
 
 import pytest
-from sctn_msgs.msg import StepConfirmation, StepResult
-
 from cell_operator import Operator
+from sctn_msgs.msg import StepConfirmation, StepResult
 
 
 @pytest.mark.parametrize("goal_module", ["image_distance", "embedding"])

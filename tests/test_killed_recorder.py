@@ -13,11 +13,10 @@ import signal
 import time
 
 import pytest
-from sctn_msgs.msg import StepConfirmation, StepResult
-from std_msgs.msg import String
-
 from bag_contents import DEEP, contents, wait_for_recorder
 from cell_operator import EVENT, Operator, nanoseconds
+from sctn_msgs.msg import StepConfirmation, StepResult
+from std_msgs.msg import String
 
 KILLS = int(os.environ.get("SCTN_KILLS", "3"))
 # Without waiting for the recorder's word: what was published so long before the kill is in the bag too.

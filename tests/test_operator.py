@@ -6,10 +6,9 @@ import copy
 from typing import Any
 
 import numpy as np
+from cell_operator import LATCHED, Operator, nanoseconds
 from rclpy.duration import Duration
 from sctn_msgs.msg import Goal, Heightmap, PickPlace, StepConfirmation, StepResult
-
-from cell_operator import LATCHED, Operator, nanoseconds
 
 NODES = {"camera_fusion", "goal_oracle", "gctn_policy", "suction_executor", "sim_workcell"}
 DISKS = 9

@@ -14,7 +14,6 @@ import types
 import pytest
 import yaml
 from catkin_pkg.packages import find_packages
-
 from processes import BINARIES, REPOSITORY
 
 PACKAGE = REPOSITORY / "nodes"
@@ -66,8 +65,7 @@ class Recorded:
         self.values, self.named = values, named
 
     def __iter__(self):
-        for value in (*self.values, *self.named.values()):
-            yield value
+        yield from (*self.values, *self.named.values())
 
 
 def parts(value: object):

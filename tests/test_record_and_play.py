@@ -12,15 +12,14 @@ import signal
 import subprocess
 
 import yaml
+from bag_contents import DEEP, STORE, contents, wait_for_recorder, wait_until_heard, writer_of
+from cell_operator import EVENT, LATCHED, STREAM, Operator, nanoseconds
+from processes import BINARIES, environment
 from rosbags.highlevel import AnyReader
 from rosgraph_msgs.msg import Clock
 from sctn_msgs.msg import StepResult
 from sensor_msgs.msg import BatteryState
 from std_msgs.msg import String
-
-from bag_contents import DEEP, STORE, contents, wait_for_recorder, wait_until_heard, writer_of
-from cell_operator import EVENT, LATCHED, STREAM, Operator, nanoseconds
-from processes import BINARIES, environment
 
 
 def end(recorder, code: int = 0) -> dict:
@@ -30,9 +29,7 @@ def end(recorder, code: int = 0) -> dict:
     return json.loads(recorder.output().splitlines()[-1])
 
 
-def test_topics_of_any_type_are_recorded_as_they_appear_and_read_by_rosbags(
-    start, operator: Operator, tmp_path: pathlib.Path
-) -> None:
+def test_topics_of_any_type_are_recorded_as_they_appear_and_read_by_rosbags(start, operator: Operator, tmp_path: pathlib.Path) -> None:
     bag = tmp_path / "bag"
     recorder = start("sctn", "bag", "record", "--all", "--exclude", "hush", "--out", bag, "--json")
     operator.spin(1.0)
@@ -82,9 +79,7 @@ def test_a_recording_is_split_and_played_as_one(start, operator: Operator, tmp_p
     heard: list[tuple[int, String]] = []
     hear = lambda text, info: heard.append((info["source_timestamp"], text))  # noqa: E731
     operator.node.create_subscription(String, "/elsewhere", hear, DEEP)
-    play = start(
-        "sctn", "bag", "play", bag, "--remap", "/chatter:=/elsewhere", "--rate", 4, "--wait", 30, "--start", 1.0, "--json"
-    )
+    play = start("sctn", "bag", "play", bag, "--remap", "/chatter:=/elsewhere", "--rate", 4, "--wait", 30, "--start", 1.0, "--json")
     operator.until(lambda: heard and heard[-1][1].data == "59", "last message", 60.0)
     assert play.wait(60.0) == 0, play.log()
     # From one second on, each message once and in order.
@@ -250,9 +245,7 @@ def test_a_bag_played_in_a_loop_ends_when_told(start, operator: Operator, tmp_pa
     assert play.wait(60.0) == 0, play.log()
 
 
-def test_a_full_disk_ends_the_recording_and_what_was_written_is_a_bag(
-    start, operator: Operator, tmp_path: pathlib.Path
-) -> None:
+def test_a_full_disk_ends_the_recording_and_what_was_written_is_a_bag(start, operator: Operator, tmp_path: pathlib.Path) -> None:
     bag = tmp_path / "bag"
     # More room than any disk has.
     recorder = start("sctn", "bag", "record", "/chatter", "--out", bag, "--min-free", 10**12, "--json")

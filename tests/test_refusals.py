@@ -12,18 +12,15 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 from builtin_interfaces.msg import Time
+from cell_operator import LATCHED, Operator, nanoseconds
 from geometry_msgs.msg import Point, Pose2D
 from rclpy.duration import Duration
 from rclpy.publisher import Publisher
 from sctn_msgs.msg import Heightmap, PickPlace, PrimitiveSettings, StepConfirmation, StepResult
 from std_msgs.msg import Header
 
-from cell_operator import LATCHED, Operator, nanoseconds
-
 ROWS, COLS, PIXEL_SIZE_M = 320, 160, 0.003125
-SETTINGS = PrimitiveSettings(
-    clearance_m=0.12, lift_m=0.08, travel_m_s=0.5, carry_m_s=0.25, descend_m_s=0.05, acceleration_m_s2=1.0
-)
+SETTINGS = PrimitiveSettings(clearance_m=0.12, lift_m=0.08, travel_m_s=0.5, carry_m_s=0.25, descend_m_s=0.05, acceleration_m_s2=1.0)
 
 # How long the arm is watched for a motion that must not come; an approved one starts within a fraction of this.
 WATCH_S = 2.0
@@ -44,8 +41,10 @@ class Cell:
         """Everybody knows everybody, and the arm has reported where it stands."""
         self.operator.until(
             # The operator subscribes to both itself.
-            lambda: min(self._heightmaps.get_subscription_count(), self._proposals.get_subscription_count()) >= 2
-            and self.operator.executor_is_ready(),
+            lambda: (
+                min(self._heightmaps.get_subscription_count(), self._proposals.get_subscription_count()) >= 2
+                and self.operator.executor_is_ready()
+            ),
             "executor that listens",
             60.0,
         )

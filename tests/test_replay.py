@@ -12,7 +12,6 @@ from collections.abc import Callable, Iterable
 from mcap.reader import make_reader
 from mcap.records import Channel, Message
 from mcap.stream_reader import StreamReader
-
 from processes import REPOSITORY, free_domain
 
 # What goes in, and what has to come out.
@@ -56,9 +55,7 @@ def test_a_recorded_run_gives_the_same_heightmaps_goals_and_proposals_again(star
     assert play.wait(240.0) == 0, play.log()
     assert json.loads(play.output().splitlines()[-1])["unsent"] == 0
     # The last of them may still be on their way.
-    wait_until(
-        lambda: all(len(found) >= len(recorded[topic]) for topic, found in flushed(unfinished).items()), "last messages"
-    )
+    wait_until(lambda: all(len(found) >= len(recorded[topic]) for topic, found in flushed(unfinished).items()), "last messages")
     record.signal(signal.SIGTERM)
     assert record.wait(60.0) == 0, record.log()
 

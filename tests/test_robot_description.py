@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import xml.etree.ElementTree
 
+from cell_operator import LATCHED, Operator
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from std_msgs.msg import String
 from tf2_msgs.msg import TFMessage
-
-from cell_operator import LATCHED, Operator
 
 # As tf2's listener subscribes.
 DYNAMIC = QoSProfile(

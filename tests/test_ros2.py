@@ -16,8 +16,10 @@ from action_msgs.msg import GoalStatus
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
-from lifecycle_msgs.msg import State, Transition, TransitionEvent
+from lifecycle_msgs.msg import Transition, TransitionEvent
 from lifecycle_msgs.srv import ChangeState, GetAvailableStates, GetAvailableTransitions, GetState
+from peer import BEST_EFFORT, LATCHED, RELIABLE, Peer, filled, interfaces
+from processes import REPOSITORY, Process, free_domain
 from rcl_interfaces.msg import Log, Parameter, ParameterEvent, ParameterType, ParameterValue
 from rcl_interfaces.srv import (
     DescribeParameters,
@@ -31,11 +33,8 @@ from rclpy.action import ActionClient, ActionServer
 from rclpy.qos import DurabilityPolicy, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
 from sctn_msgs.action import ExecutePickPlace
-from sctn_msgs.msg import Heightmap, PickPlace, Reward
+from sctn_msgs.msg import PickPlace, Reward
 from sensor_msgs.msg import CameraInfo
-
-from peer import BEST_EFFORT, LATCHED, RELIABLE, Peer, filled, interfaces
-from processes import REPOSITORY, Process, free_domain
 
 ROUNDS = 3
 
@@ -279,9 +278,7 @@ def test_two_cells_live_in_one_domain_by_namespace_and_remap(start, peer: Peer) 
     assert {message.delta for message in b} == {2.0}
     # Private names follow the node's new name.
     services = peer.node.get_service_names_and_types_by_node
-    peer.until(
-        lambda: "/cell_b/other_echo/get_parameters" in dict(services("other_echo", "/cell_b")), "service of the new name"
-    )
+    peer.until(lambda: "/cell_b/other_echo/get_parameters" in dict(services("other_echo", "/cell_b")), "service of the new name")
 
 
 def test_rclpy_sees_names_types_and_qos_of_the_graph(start, peer: Peer) -> None:
@@ -301,6 +298,7 @@ def test_rclpy_sees_names_types_and_qos_of_the_graph(start, peer: Peer) -> None:
     wanted = peer.until(lambda: node.get_subscriptions_info_by_topic("/seen/front/color/image_raw"), "image subscription")
     assert wanted[0].topic_type == "sensor_msgs/msg/Image"
     assert wanted[0].qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT
+
     def published() -> Any:
         return dict(node.get_publisher_names_and_types_by_node("camera_fusion", "/seen"))
 
@@ -356,9 +354,7 @@ def test_parameters_are_listed_described_and_got(fusion: str, peer: Peer) -> Non
     request = ListParameters.Request(prefixes=["workspace"], depth=1)
     below = peer.call(ListParameters, f"{fusion}/list_parameters", request).result
     assert all(name.startswith("workspace.") for name in below.names) and below.names
-    described = peer.call(
-        DescribeParameters, f"{fusion}/describe_parameters", DescribeParameters.Request(names=listed.names)
-    ).descriptors
+    described = peer.call(DescribeParameters, f"{fusion}/describe_parameters", DescribeParameters.Request(names=listed.names)).descriptors
     assert [one.name for one in described] == list(listed.names)
     assert all(one.description for one in described)
     by_name = {one.name: one for one in described}
@@ -369,9 +365,7 @@ def test_parameters_are_listed_described_and_got(fusion: str, peer: Peer) -> Non
     assert rows.read_only
     assert rows.integer_range[0].from_value == 1
     names = ["tolerance_s", "cameras", "no_such_parameter"]
-    tolerance_s, cameras, unknown = peer.call(
-        GetParameters, f"{fusion}/get_parameters", GetParameters.Request(names=names)
-    ).values
+    tolerance_s, cameras, unknown = peer.call(GetParameters, f"{fusion}/get_parameters", GetParameters.Request(names=names)).values
     assert (tolerance_s.double_value, list(cameras.string_array_value)) == (0.05, ["front", "left", "right"])
     assert unknown.type == ParameterType.PARAMETER_NOT_SET
     types = peer.call(GetParameterTypes, f"{fusion}/get_parameter_types", GetParameterTypes.Request(names=names)).types
@@ -621,8 +615,10 @@ def test_a_signal_ends_a_node_cleanly(start, peer: Peer, number: signal.Signals)
     assert process.wait(60.0) == 0
     assert "finalized" in process.errors()
     peer.until(
-        lambda: ("camera_fusion", namespace) not in peer.node.get_node_names_and_namespaces()
-        and not peer.node.count_publishers(f"{namespace}/heightmap"),
+        lambda: (
+            ("camera_fusion", namespace) not in peer.node.get_node_names_and_namespaces()
+            and not peer.node.count_publishers(f"{namespace}/heightmap")
+        ),
         "end of the node in rclpy's graph",
         5.0,
     )

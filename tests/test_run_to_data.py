@@ -14,12 +14,11 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet
 import pytest
+from bag_contents import same
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
-from rosbags.highlevel import AnyReader
-
-from bag_contents import same
 from processes import REPOSITORY
+from rosbags.highlevel import AnyReader
 
 
 @pytest.fixture(scope="module")
@@ -39,9 +38,7 @@ def test_training_takes_recorded_runs(start, run: pathlib.Path, tmp_path: pathli
         assert count == 1, key
     (tmp_path / "recipe.yaml").write_text(recipe)
     # The folder of the launch, and the bag itself.
-    train = start(
-        "sctn", "train", "--recipe", tmp_path / "recipe.yaml", "--demos", run, run / "run", "--out", tmp_path / "out", "--json"
-    )
+    train = start("sctn", "train", "--recipe", tmp_path / "recipe.yaml", "--demos", run, run / "run", "--out", tmp_path / "out", "--json")
     assert train.wait(400.0) == 0, train.log()
     assert pathlib.Path(json.loads(train.output().splitlines()[-1])["policy"]).is_file()
     assert "2 demonstrations" in train.errors()

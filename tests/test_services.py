@@ -8,19 +8,16 @@ import uuid
 import numpy as np
 import pytest
 from action_msgs.msg import GoalStatus
+from cell_operator import Operator, nanoseconds
 from geometry_msgs.msg import Pose2D
+from processes import free_domain
 from rclpy.action import ActionClient
 from rclpy.client import Client
 from sctn_msgs.action import ExecutePickPlace
 from sctn_msgs.msg import Goal, Heightmap, PickPlace, PrimitiveSettings, StepConfirmation, StepResult
 from sctn_msgs.srv import CaptureGoal, LoadDemonstration, ResetCell, SetStep
 
-from cell_operator import Operator, nanoseconds
-from processes import free_domain
-
-SETTINGS = PrimitiveSettings(
-    clearance_m=0.12, lift_m=0.08, travel_m_s=0.5, carry_m_s=0.25, descend_m_s=0.05, acceleration_m_s2=1.0
-)
+SETTINGS = PrimitiveSettings(clearance_m=0.12, lift_m=0.08, travel_m_s=0.5, carry_m_s=0.25, descend_m_s=0.05, acceleration_m_s2=1.0)
 
 
 class Cell:
@@ -48,9 +45,11 @@ class Cell:
 
     def wait_for_executor(self) -> None:
         self.operator.until(
-            lambda: self.execute.server_is_ready()
-            and self.operator.executor_is_ready()
-            and self.operator.has_heard("suction_executor", "/heightmap"),
+            lambda: (
+                self.execute.server_is_ready()
+                and self.operator.executor_is_ready()
+                and self.operator.has_heard("suction_executor", "/heightmap")
+            ),
             "executor that sees the cell",
             60.0,
         )
@@ -131,9 +130,7 @@ def name() -> str:
 
 
 def newest_goal(cell: Cell, after: int, **fields: object) -> Goal:
-    return cell.operator.next(
-        "goal", after, lambda goal: all(getattr(goal, field) == value for field, value in fields.items())
-    )
+    return cell.operator.next("goal", after, lambda goal: all(getattr(goal, field) == value for field, value in fields.items()))
 
 
 def test_a_sequence_is_taught_from_nothing_and_a_repeated_call_captures_nothing_more(cell: Cell) -> None:

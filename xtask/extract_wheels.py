@@ -18,9 +18,7 @@ def main() -> None:
         with zipfile.ZipFile(wheel) as archive:
             for member in archive.infolist():
                 for source, target in rules.items():
-                    if member.is_dir() or not (
-                        member.filename == source or (source.endswith("/") and member.filename.startswith(source))
-                    ):
+                    if member.is_dir() or not (member.filename == source or (source.endswith("/") and member.filename.startswith(source))):
                         continue
                     path = destination / (target + member.filename[len(source) :])
                     path.parent.mkdir(parents=True, exist_ok=True)

@@ -1,6 +1,6 @@
 """Makes standard_definitions.txt with rosbags: the fields of ROS 2 Jazzy's own message types, and their RIHS01 hashes.
 
-    python bags/src/standard_definitions.py
+python bags/src/standard_definitions.py
 """
 
 import pathlib

@@ -47,9 +47,7 @@ def generate_launch_description() -> LaunchDescription:
                 default_value="",
                 description="Poses of the cameras, as config/calibration.yaml explains; empty: from /tf_static.",
             ),
-            DeclareLaunchArgument(
-                "urdf", default_value=share("urdf", "workcell.urdf"), description="The work cell, calibrated."
-            ),
+            DeclareLaunchArgument("urdf", default_value=share("urdf", "workcell.urdf"), description="The work cell, calibrated."),
             DeclareLaunchArgument("publish_cell", default_value="false", description="Whether to publish the cell's description and tf."),
             DeclareLaunchArgument("rviz", default_value="false", description="Whether to show the cell in RViz."),
             node("camera_fusion", calibration=LaunchConfiguration("calibration")),
@@ -60,9 +58,7 @@ def generate_launch_description() -> LaunchDescription:
                 package="robot_state_publisher",
                 executable="robot_state_publisher",
                 namespace=LaunchConfiguration("namespace"),
-                parameters=[
-                    {"robot_description": ParameterValue(Command(["cat ", LaunchConfiguration("urdf")]), value_type=str)}
-                ],
+                parameters=[{"robot_description": ParameterValue(Command(["cat ", LaunchConfiguration("urdf")]), value_type=str)}],
                 condition=IfCondition(LaunchConfiguration("publish_cell")),
             ),
             Node(

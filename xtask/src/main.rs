@@ -1,9 +1,12 @@
 //! Set-up, demonstration run and tests of the whole repository: `cargo xtask --help`.
 
+mod check;
 mod command;
 mod demo;
+mod layers;
 mod libtorch;
 mod licences;
+mod packages;
 mod python;
 mod stage;
 
@@ -25,6 +28,12 @@ enum Task {
         /// Also make what the end-to-end tests need: .venv with rclpy and our messages
         #[arg(long)]
         python: bool,
+    },
+    /// After an edit: formatting, clippy and unit tests of the packages that have changed
+    Check {
+        /// Check these packages instead of those with a change since origin/main
+        #[arg(short = 'p', long = "package", value_name = "CRATE")]
+        packages: Vec<String>,
     },
     /// Run every check of the repository
     Test {
@@ -57,6 +66,7 @@ fn main() -> Result<()> {
             }
             Ok(())
         }
+        Task::Check { packages } => check::run_checks(&packages),
         Task::Test { only, pytest } => stage::run_all(&only, &pytest),
         Task::Demo { problem, seed } => demo::run_problem(&problem, seed),
         Task::Licences => licences::check(),

@@ -56,6 +56,15 @@ pub fn with_pytorch() -> Option<PathBuf> {
         .find(|python| output(command(python).args(["-c", "import torch"])).is_ok())
 }
 
+/// ruff over every Python file of the repository, by the rules of ruff.toml.
+pub fn lint() -> Result<()> {
+    let environment = Environment::set_up()?;
+    for check in [&["check"][..], &["format", "--check"]] {
+        run(environment.python()?.args(["-m", "ruff"]).args(check))?;
+    }
+    Ok(())
+}
+
 /// The 11 of Python 3.11.
 fn minor_version(python: &Path) -> Result<u32> {
     let script = "import sys; print(*sys.version_info[:2])";

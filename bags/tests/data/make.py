@@ -1,6 +1,6 @@
 """Makes the bags of this folder with rosbags: what another program writes, for ../bags.rs to read.
 
-    python bags/tests/data/make.py
+python bags/tests/data/make.py
 """
 
 import pathlib

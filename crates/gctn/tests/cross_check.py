@@ -109,10 +109,7 @@ def published(net, config, observation, goal):
 
 def compact_input(observation, goal):
     """The 14 channels that the compact network reads."""
-    seen, wanted = (
-        np.concatenate([h["rgb"].transpose(2, 0, 1) / 128 - 1.1, h["height_m"][None] / 0.04])
-        for h in (observation, goal)
-    )
+    seen, wanted = (np.concatenate([h["rgb"].transpose(2, 0, 1) / 128 - 1.1, h["height_m"][None] / 0.04]) for h in (observation, goal))
     change = wanted - seen
     colour, height = np.abs(change[:3]).mean(0, keepdims=True), np.abs(change[3:])
     return np.concatenate([seen, wanted, change, colour, height])
@@ -134,7 +131,7 @@ def compact(net, config, x):
         x = upsample(net.conv(f"rise{level}.lateral", x)) + skips[level]
         x = block(f"rise{level}.block", x)
     heads = np.split(relu(net.conv("heads", x)), 3)
-    pick, query, key = (net.conv(name, head) for name, head in zip(("pick", "query", "key"), heads))
+    pick, query, key = (net.conv(name, head) for name, head in zip(("pick", "query", "key"), heads, strict=False))
     margin = config["network"]["window_cells"] // 2
     return pick[0], query, pad(key, margin, margin), net.weights["scale"][0]
 

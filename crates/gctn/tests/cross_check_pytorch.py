@@ -121,7 +121,7 @@ def shared(net, config, x):
     """Pick logits, query features, key features with their margin, scale."""
     x = TRUNKS[config["network"]["kind"]](net, config, x)
     heads = F.relu(net.conv("heads", x)).chunk(3, 1)
-    pick, query, key = (net.conv(name, head)[0] for name, head in zip(("pick", "query", "key"), heads))
+    pick, query, key = (net.conv(name, head)[0] for name, head in zip(("pick", "query", "key"), heads, strict=False))
     margin = config["network"]["window_cells"] // 2
     return pick[0], query, F.pad(key, (margin,) * 4), net.weights["scale"]
 
@@ -216,9 +216,7 @@ class Case:
         margin = 0 if self.shared else size // 2
         center = [coordinate + margin for coordinate in self.index(self.case["pick_px"])]
         right, wrong = self.case["rotation"], self.case["wrong_rotation"]
-        kernels = torch.stack(
-            [window(query, center, 2 * math.pi * r / rotations, size, bilinear) for r in range(rotations)]
-        )
+        kernels = torch.stack([window(query, center, 2 * math.pi * r / rotations, size, bilinear) for r in range(rotations)])
         place = scale * F.conv2d(key[None], kernels)[0, :, : self.rows, : self.cols]
 
         def log_sum_exp(x):
@@ -258,7 +256,7 @@ def main():
 
     theirs = case.named("gradient")
     assert theirs.keys() == case.weights.keys()
-    ours = dict(zip(case.weights, torch.autograd.grad(losses.sum(), list(case.weights.values()))))
+    ours = dict(zip(case.weights, torch.autograd.grad(losses.sum(), list(case.weights.values())), strict=False))
     largest = max(gradient.abs().max() for gradient in ours.values())
     worst = 0.0
     for name, gradient in ours.items():

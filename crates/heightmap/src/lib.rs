@@ -13,7 +13,7 @@ mod workspace;
 pub use camera::{Camera, CameraError, Intrinsics};
 pub use distortion::Distortion;
 pub use fusion::{Fusion, FusionError, FusionReport, View};
-pub use workspace::{Heightmap, HeightmapError, Pixel, Workspace, WorkspaceError};
+pub use workspace::{Disk, Heightmap, HeightmapError, Pixel, Workspace, WorkspaceError};
 
 /// The examples of the README are run as tests.
 #[cfg(doctest)]

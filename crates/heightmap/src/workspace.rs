@@ -42,6 +42,15 @@ pub struct Pixel {
     pub col: usize,
 }
 
+/// A disk in the xy-plane of the world, for instance about a pick to be left out.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Disk {
+    /// Its centre.
+    pub center_m: Point2<f64>,
+    /// Its radius.
+    pub radius_m: f64,
+}
+
 impl Workspace {
     /// The 0.5 x 1 m table of Ravens: 320 x 160 cells of 3.125 mm (Zeng et al., CoRL 2020).
     pub const RAVENS: Self = Self {

@@ -1,0 +1,847 @@
+//! What may move: the approvals of an operator against what the executor knows.
+//!
+//! Only the newest valid proposal can be approved, once; what became of the ones before is remembered, so that a refusal can
+//! say it.
+
+use std::collections::VecDeque;
+use std::sync::Arc;
+use std::time::Duration;
+
+use heightmap::{Heightmap, Workspace};
+use pick_place::{PickPlace, PrimitiveSettings};
+
+use crate::mutation::{Mutation, planted};
+use crate::{OperatorDecision, Proposal, ProposalId, ProposalStatus, StepOutcome};
+
+/// Heightmaps kept, by stamp, until the proposals that were made from them arrive.
+const HEIGHTMAPS: usize = 64;
+/// Proposals whose status is remembered.
+const PROPOSALS: usize = 1024;
+/// Invalid proposals of which it is remembered why.
+const INVALID: usize = 64;
+/// Confirmations that wait for their proposal; more are refused at once.
+const WAITING: usize = 16;
+
+/// What a proposal must keep to.
+#[derive(Clone, Debug, PartialEq)]
+pub struct GateRules {
+    /// Frame of proposals.
+    pub frame: String,
+    /// Largest heights and speeds.
+    pub limits: PrimitiveSettings,
+    /// A cell of the heightmap has changed when its height differs by more.
+    pub observation_tolerance_m: f32,
+    /// The observation has changed when more than this share of its cells has.
+    pub observation_changed_fraction: f64,
+    /// How long a confirmation waits for its proposal or its heightmap.
+    pub confirmation_grace: Duration,
+    /// Whether proposals move only when somebody approves them.
+    pub require_approval: bool,
+}
+
+/// Why a message is no proposal that could be approved.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+pub enum InvalidProposal {
+    /// Not readable.
+    #[error("{0}")]
+    Message(String),
+    /// In another frame.
+    #[error("proposal {id}: frame is `{actual}`, expected `{expected}`")]
+    Frame {
+        /// The proposal.
+        id: ProposalId,
+        /// Its frame.
+        actual: String,
+        /// That of the world.
+        expected: String,
+    },
+    /// A pose has a coordinate that is not finite.
+    #[error("proposal {id}: {which} pose x {x_m} m, y {y_m} m, yaw {yaw_rad} rad is not finite")]
+    NotFinite {
+        /// The proposal.
+        id: ProposalId,
+        /// Pick or place.
+        which: &'static str,
+        /// Position.
+        x_m: f64,
+        /// Position.
+        y_m: f64,
+        /// Angle.
+        yaw_rad: f64,
+    },
+    /// A pose lies outside the heightmap.
+    #[error(
+        "proposal {id}: {which} pose x {x_m:.4} m, y {y_m:.4} m lies outside the workspace, x {}..{} m, y {}..{} m",
+        workspace.origin_m.x,
+        workspace.origin_m.x + workspace.cols as f64 * workspace.pixel_size_m,
+        workspace.origin_m.y,
+        workspace.origin_m.y + workspace.rows as f64 * workspace.pixel_size_m
+    )]
+    OutsideWorkspace {
+        /// The proposal.
+        id: ProposalId,
+        /// Pick or place.
+        which: &'static str,
+        /// Position.
+        x_m: f64,
+        /// Position.
+        y_m: f64,
+        /// That of the heightmap.
+        workspace: Box<Workspace>,
+    },
+    /// A height or speed out of range.
+    #[error("proposal {id}: settings.{name} is {value}, expected above 0 and at most {limit}")]
+    Settings {
+        /// The proposal.
+        id: ProposalId,
+        /// Name of the setting.
+        name: &'static str,
+        /// Its value.
+        value: f64,
+        /// The largest allowed.
+        limit: f64,
+    },
+    /// Two messages of one id ask for different motions.
+    #[error("proposal {id} came twice with different contents")]
+    DifferentContents {
+        /// The proposal.
+        id: ProposalId,
+    },
+}
+
+/// Why a confirmation moves nothing.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+pub enum Refusal {
+    /// No such proposal has arrived.
+    #[error("proposal {id} is unknown")]
+    Unknown {
+        /// The proposal named.
+        id: ProposalId,
+    },
+    /// A stop that names no known proposal, with nothing to stop.
+    #[error("proposal {id} is unknown; nothing was moving")]
+    NothingToStop {
+        /// The proposal named.
+        id: ProposalId,
+    },
+    /// The message of that id was no proposal.
+    #[error(transparent)]
+    Invalid(#[from] InvalidProposal),
+    /// Something else became of it.
+    #[error("proposal {id} {status}")]
+    NotPending {
+        /// The proposal.
+        id: ProposalId,
+        /// What became of it.
+        status: ProposalStatus,
+    },
+    /// Another one is being carried out.
+    #[error("proposal {id} was approved while proposal {moving} is being carried out")]
+    Busy {
+        /// The proposal.
+        id: ProposalId,
+        /// The other one.
+        moving: ProposalId,
+    },
+    /// The arm is on its way home.
+    #[error("proposal {id} was approved while the arm is on its way home")]
+    Homing {
+        /// The proposal.
+        id: ProposalId,
+    },
+    /// The robot cannot move now, or not so.
+    #[error("proposal {id}: {reason}")]
+    Robot {
+        /// The proposal.
+        id: ProposalId,
+        /// Why.
+        reason: String,
+    },
+    /// Made from what was seen before the last motion ended.
+    #[error(
+        "proposal {id} was made from an observation at {}, before the last motion ended at {}",
+        seconds(*stamp),
+        seconds(*moved_until)
+    )]
+    OldObservation {
+        /// The proposal.
+        id: ProposalId,
+        /// Of its heightmap.
+        stamp: Duration,
+        /// The end of the motion.
+        moved_until: Duration,
+    },
+    /// The heightmap that it was made from is not known.
+    #[error(
+        "proposal {id}: the heightmap of {}, which it was made from, has not arrived",
+        seconds(*stamp)
+    )]
+    NoSourceHeightmap {
+        /// The proposal.
+        id: ProposalId,
+        /// Of its heightmap.
+        stamp: Duration,
+    },
+    /// The cameras cover another workspace now.
+    #[error(
+        "proposal {id}: the heightmap of {} covers another workspace than the one that it was made from",
+        seconds(*stamp)
+    )]
+    OtherWorkspace {
+        /// The proposal.
+        id: ProposalId,
+        /// Of the newest heightmap.
+        stamp: Duration,
+    },
+    /// The workspace does not look as it did.
+    #[error(
+        "proposal {id}: the observation has changed since: {:.2} % of the cells of the heightmap of {} by more than {tolerance_m} m, expected at most {:.2} %",
+        100.0 * fraction,
+        seconds(*stamp),
+        100.0 * limit
+    )]
+    ObservationChanged {
+        /// The proposal.
+        id: ProposalId,
+        /// Of the newest heightmap.
+        stamp: Duration,
+        /// Share of the cells that have changed.
+        fraction: f64,
+        /// By more than this.
+        tolerance_m: f32,
+        /// Share that would do.
+        limit: f64,
+    },
+    /// It waited for its proposal when a stop came.
+    #[error("proposal {id}: a stop came before it")]
+    StopCame {
+        /// The proposal named.
+        id: ProposalId,
+    },
+    /// It waited for its proposal when a motion failed.
+    #[error("proposal {id}: a motion was broken off before it")]
+    MotionBrokenOff {
+        /// The proposal named.
+        id: ProposalId,
+    },
+}
+
+/// What became of a proposal that arrived.
+#[derive(Clone, Debug, PartialEq)]
+pub enum Proposed {
+    /// It can be approved.
+    Pending,
+    /// It came before; nothing has changed.
+    Repeated,
+    /// It cannot be approved, for this reason.
+    Invalid(InvalidProposal),
+}
+
+/// The executor's word on a proposal, without motion.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Report {
+    /// The proposal.
+    pub id: ProposalId,
+    /// What became of it.
+    pub outcome: StepOutcome,
+    /// Why, for people.
+    pub reason: String,
+    /// Where it stands after this word.
+    pub status: Option<ProposalStatus>,
+}
+
+/// What the executor is to do.
+#[derive(Clone, Debug, PartialEq)]
+pub enum GateAction {
+    /// Move; [`ApprovalGate::finish`] has to follow.
+    Move(Box<Proposal>),
+    /// Stop the motion under way.
+    Cancel,
+    /// Say this.
+    Report(Report),
+}
+
+/// What the gate asks about the robot, at the moment of an approval.
+pub trait RobotState {
+    /// Why the arm must not move now, if there is a reason.
+    fn obstacle(&self) -> Option<String>;
+
+    /// Plans the whole motion from where the arm is.
+    ///
+    /// # Errors
+    /// Says what cannot be planned.
+    fn plan(&self, proposal: &Proposal) -> Result<(), String>;
+}
+
+/// The answer to a confirmation.
+enum Verdict {
+    Act(GateAction),
+    Report(StepOutcome, String),
+    Refuse(Refusal),
+    /// What it needs may still be on its way: ask again a little later, then refuse for this reason.
+    Wait(Refusal),
+    Nothing,
+}
+
+/// The newest valid proposal.
+#[derive(Debug)]
+struct Newest {
+    proposal: Proposal,
+    /// What was found to be wrong with it since.
+    invalid: Option<InvalidProposal>,
+    /// The heightmap that it was made from, once it has arrived.
+    source_heightmap: Option<Arc<Heightmap>>,
+}
+
+/// A confirmation that arrived before what it speaks of.
+#[derive(Clone, Copy, Debug)]
+struct Waiting {
+    id: ProposalId,
+    decision: OperatorDecision,
+    until: Duration,
+}
+
+/// Decides what may move. All times are passed in: `now` is monotonic, stamps are ROS time.
+#[derive(Debug)]
+pub struct ApprovalGate {
+    rules: GateRules,
+    /// The first of each stamp, oldest first.
+    heightmaps: VecDeque<(Duration, Arc<Heightmap>)>,
+    /// The newest observation.
+    latest: Option<(Duration, Arc<Heightmap>)>,
+    newest: Option<Newest>,
+    /// Oldest first; the last is the newest proposal's.
+    statuses: VecDeque<(ProposalId, ProposalStatus)>,
+    /// Invalid proposals, and why. Kept apart: no number of them takes anything from a valid one.
+    invalid: VecDeque<(ProposalId, InvalidProposal)>,
+    waiting: VecDeque<Waiting>,
+    moving: Option<ProposalId>,
+    /// The arm is on its way home at an operator's call.
+    homing: bool,
+    /// Heightmaps from before the end of the last motion are no ground to move on.
+    moved_until: Option<Duration>,
+    /// Whether new proposals move by themselves.
+    automatic: bool,
+}
+
+impl ApprovalGate {
+    /// A gate that has received nothing yet.
+    pub fn new(rules: GateRules) -> Self {
+        Self {
+            heightmaps: VecDeque::new(),
+            latest: None,
+            newest: None,
+            statuses: VecDeque::new(),
+            invalid: VecDeque::new(),
+            waiting: VecDeque::new(),
+            moving: None,
+            homing: false,
+            moved_until: None,
+            automatic: !rules.require_approval,
+            rules,
+        }
+    }
+
+    /// From the next confirmation on.
+    pub fn set_rules(&mut self, rules: GateRules) {
+        self.rules = rules;
+    }
+
+    /// The proposal that is being carried out.
+    pub fn moving(&self) -> Option<ProposalId> {
+        self.moving
+    }
+
+    /// Whether the executor approves new proposals itself: approval is not required, and no stop or fault has come since
+    /// the last approval.
+    pub fn is_automatic(&self) -> bool {
+        self.automatic
+    }
+
+    /// Takes the newest observation.
+    pub fn on_heightmap(&mut self, stamp: Duration, heightmap: Arc<Heightmap>) {
+        let known = self.heightmaps.iter().find(|(known, _)| *known == stamp);
+        let heightmap = match known {
+            // The same frame may come again; another of the same stamp is a change.
+            Some((_, known)) if *known == heightmap => Arc::clone(known),
+            Some(_) => heightmap,
+            None => {
+                if self.heightmaps.len() == HEIGHTMAPS {
+                    self.heightmaps.pop_front();
+                }
+                self.heightmaps.push_back((stamp, Arc::clone(&heightmap)));
+                heightmap
+            }
+        };
+        self.latest = Some((stamp, heightmap));
+        self.find_source();
+    }
+
+    /// Keeps the heightmap of the newest proposal, however many come after it.
+    fn find_source(&mut self) {
+        if let Some(Newest {
+            proposal,
+            source_heightmap: source @ None,
+            ..
+        }) = &mut self.newest
+        {
+            let mut known = self.heightmaps.iter();
+            let known = known.find(|(stamp, _)| *stamp == proposal.stamp);
+            *source = known.map(|(_, heightmap)| Arc::clone(heightmap));
+        }
+    }
+
+    /// Takes a proposal, or what is wrong with the message of that id. A valid one supersedes the one before; an invalid
+    /// message never supersedes the pending proposal.
+    pub fn on_proposal(&mut self, id: ProposalId, proposal: Result<Proposal, String>) -> Proposed {
+        if self.status(id).is_some() {
+            if let Some(newest) = &mut self.newest
+                && newest.proposal.id == id
+                && newest.invalid.is_none()
+                && !proposal.is_ok_and(|proposal| newest.proposal.is_same_motion(&proposal))
+            {
+                let reason = InvalidProposal::DifferentContents { id };
+                newest.invalid = Some(reason.clone());
+                return Proposed::Invalid(reason);
+            }
+            return Proposed::Repeated;
+        }
+        if self.why_invalid(id).is_some() {
+            return Proposed::Repeated;
+        }
+        let workspace = self.latest.as_ref().map(|(_, latest)| latest.workspace);
+        let checked = proposal.map_err(InvalidProposal::Message);
+        let checked = checked.and_then(|proposal| {
+            self.rules.check(&proposal)?;
+            check_inside(&proposal, workspace)?;
+            Ok(proposal)
+        });
+        let proposal = match checked {
+            Ok(proposal) => proposal,
+            Err(reason) => {
+                if self.invalid.len() == INVALID {
+                    self.invalid.pop_front();
+                }
+                self.invalid.push_back((id, reason.clone()));
+                return Proposed::Invalid(reason);
+            }
+        };
+        if !planted(Mutation::SupersededStaysPending) {
+            self.close_pending(ProposalStatus::Superseded);
+        }
+        if self.statuses.len() == PROPOSALS {
+            self.statuses.pop_front();
+        }
+        self.statuses.push_back((id, ProposalStatus::Pending));
+        self.newest = Some(Newest {
+            proposal,
+            invalid: None,
+            source_heightmap: None,
+        });
+        self.find_source();
+        Proposed::Pending
+    }
+
+    fn why_invalid(&self, id: ProposalId) -> Option<&InvalidProposal> {
+        let mut known = self.invalid.iter().rev();
+        known
+            .find(|(known, _)| *known == id)
+            .map(|(_, reason)| reason)
+    }
+
+    /// The answer about an id without a status.
+    fn unknown(&self, id: ProposalId) -> Verdict {
+        match self.why_invalid(id) {
+            Some(reason) => Verdict::Refuse(reason.clone().into()),
+            None => Verdict::Wait(Refusal::Unknown { id }),
+        }
+    }
+
+    /// Takes a confirmation. Decisions that speak of a motion that was carried out are for the goal tracker.
+    pub fn on_confirmation(
+        &mut self,
+        id: ProposalId,
+        decision: OperatorDecision,
+        robot: &impl RobotState,
+        now: Duration,
+    ) -> Vec<GateAction> {
+        self.confirm(id, decision, robot, now, None)
+    }
+
+    /// Answers the confirmations that wait, where what they wait for has arrived or their time is up.
+    pub fn on_news(&mut self, robot: &impl RobotState, now: Duration) -> Vec<GateAction> {
+        let waiting = std::mem::take(&mut self.waiting);
+        let again = |waiting: Waiting| {
+            let Waiting {
+                id,
+                decision,
+                until,
+            } = waiting;
+            self.confirm(id, decision, robot, now, Some(until))
+        };
+        waiting.into_iter().flat_map(again).collect()
+    }
+
+    /// When [`Self::on_news`] has to be called at the latest.
+    pub fn deadline(&self) -> Option<Duration> {
+        self.waiting.iter().map(|waiting| waiting.until).min()
+    }
+
+    /// `until`: how long it may wait, where it has waited already.
+    fn confirm(
+        &mut self,
+        id: ProposalId,
+        decision: OperatorDecision,
+        robot: &impl RobotState,
+        now: Duration,
+        until: Option<Duration>,
+    ) -> Vec<GateAction> {
+        let mut actions = Vec::new();
+        if decision == OperatorDecision::Stop {
+            // Nothing goes on by itself after a stop.
+            self.automatic = false;
+            if !planted(Mutation::WaitingSurvivesStop) {
+                actions.extend(self.refuse_waiting(|id| Refusal::StopCame { id }));
+            }
+        }
+        let verdict = match decision {
+            OperatorDecision::Approve => self.approve(id, robot),
+            OperatorDecision::Reject => self.reject(id),
+            OperatorDecision::Stop => self.stop(id),
+            OperatorDecision::Advance | OperatorDecision::Retry | OperatorDecision::StepBack => {
+                Verdict::Nothing
+            }
+        };
+        match verdict {
+            Verdict::Act(action) => actions.push(action),
+            Verdict::Report(outcome, reason) => actions.push(self.report(id, outcome, reason)),
+            Verdict::Refuse(refusal) => actions.push(self.refuse(id, &refusal)),
+            Verdict::Wait(refusal) => {
+                let until = until.unwrap_or(now + self.rules.confirmation_grace);
+                if now >= until || self.waiting.len() >= WAITING {
+                    actions.push(self.refuse(id, &refusal));
+                } else {
+                    self.waiting.push_back(Waiting {
+                        id,
+                        decision,
+                        until,
+                    });
+                }
+            }
+            Verdict::Nothing => {}
+        }
+        actions
+    }
+
+    fn report(&self, id: ProposalId, outcome: StepOutcome, reason: String) -> GateAction {
+        GateAction::Report(Report {
+            id,
+            outcome,
+            reason,
+            status: self.status(id),
+        })
+    }
+
+    fn refuse(&self, id: ProposalId, refusal: &Refusal) -> GateAction {
+        self.report(id, StepOutcome::Refused, refusal.to_string())
+    }
+
+    fn refuse_waiting(&mut self, refusal: impl Fn(ProposalId) -> Refusal) -> Vec<GateAction> {
+        let waiting = std::mem::take(&mut self.waiting);
+        let refuse = |waiting: Waiting| self.refuse(waiting.id, &refusal(waiting.id));
+        waiting.into_iter().map(refuse).collect()
+    }
+
+    /// Says why a proposal cannot be approved any more; whether it can be now, only [`Self::on_confirmation`] knows.
+    ///
+    /// # Errors
+    /// It is not pending.
+    pub fn check_pending(&self, id: ProposalId) -> Result<(), Refusal> {
+        match (self.status(id), &self.newest) {
+            (None, _) => Err(match self.why_invalid(id) {
+                Some(reason) => reason.clone().into(),
+                None => Refusal::Unknown { id },
+            }),
+            (Some(ProposalStatus::Pending), Some(newest)) if newest.proposal.id == id => {
+                match &newest.invalid {
+                    Some(reason) => Err(reason.clone().into()),
+                    None => Ok(()),
+                }
+            }
+            (Some(status), _) => Err(Refusal::NotPending { id, status }),
+        }
+    }
+
+    /// Takes a proposal back that nobody has approved yet.
+    pub fn withdraw(&mut self, id: ProposalId) {
+        if self.status(id) == Some(ProposalStatus::Pending) {
+            self.set_status(id, ProposalStatus::Withdrawn);
+        }
+    }
+
+    /// Asks whether the arm may go home, as an operator has called for; [`Self::finish`] has to follow where it may.
+    ///
+    /// # Errors
+    /// Says why not.
+    pub fn go_home(&mut self, robot: &impl RobotState) -> Result<(), String> {
+        if let Some(id) = self.moving {
+            return Err(format!("proposal {id} is being carried out"));
+        }
+        if let Some(obstacle) = robot.obstacle() {
+            return Err(obstacle);
+        }
+        self.homing = true;
+        Ok(())
+    }
+
+    /// The motion of [`GateAction::Move`] or [`Self::go_home`] has ended; `until` is the ROS time from which on heightmaps
+    /// show its result. `broken_off`: by a stop or a fault, after which nothing goes on by itself.
+    pub fn finish(&mut self, until: Duration, broken_off: bool) -> Vec<GateAction> {
+        let moved = self.moving.take();
+        if let Some(id) = moved {
+            let done = match planted(Mutation::ApprovalMovesTwice) {
+                true => ProposalStatus::Pending,
+                false => ProposalStatus::Done,
+            };
+            self.set_status(id, done);
+        }
+        if moved.is_some() || std::mem::take(&mut self.homing) {
+            self.moved_until = Some(until).filter(|_| !planted(Mutation::ApprovalMovesTwice));
+        }
+        if !broken_off {
+            return Vec::new();
+        }
+        self.automatic = false;
+        self.refuse_waiting(|id| Refusal::MotionBrokenOff { id })
+    }
+
+    /// The node is deactivated: no approval from before may move anything later.
+    pub fn deactivate(&mut self) {
+        if !planted(Mutation::WaitingSurvivesDeactivation) {
+            self.waiting.clear();
+        }
+    }
+
+    fn approve(&mut self, id: ProposalId, robot: &impl RobotState) -> Verdict {
+        let id = match &self.newest {
+            Some(newest) if planted(Mutation::AnyApprovalMovesNewest) => newest.proposal.id,
+            _ => id,
+        };
+        match self.status(id) {
+            None => return self.unknown(id),
+            Some(ProposalStatus::Pending) => {}
+            Some(status) => return Verdict::Refuse(Refusal::NotPending { id, status }),
+        }
+        if let Some(moving) = self.moving
+            && !planted(Mutation::MovesWhileMoving)
+        {
+            return Verdict::Refuse(Refusal::Busy { id, moving });
+        }
+        if self.homing {
+            return Verdict::Refuse(Refusal::Homing { id });
+        }
+        // Only the newest proposal is pending.
+        let newest = match &self.newest {
+            Some(newest)
+                if newest.proposal.id == id || planted(Mutation::SupersededStaysPending) =>
+            {
+                newest
+            }
+            _ => {
+                let status = ProposalStatus::Superseded;
+                return Verdict::Refuse(Refusal::NotPending { id, status });
+            }
+        };
+        if let Some(reason) = &newest.invalid {
+            return Verdict::Refuse(reason.clone().into());
+        }
+        let proposal = &newest.proposal;
+        if let Some(reason) = robot.obstacle() {
+            return Verdict::Refuse(Refusal::Robot { id, reason });
+        }
+        if let Some(moved_until) = self.moved_until
+            && proposal.stamp < moved_until
+        {
+            return Verdict::Refuse(Refusal::OldObservation {
+                id,
+                stamp: proposal.stamp,
+                moved_until,
+            });
+        }
+        if let Err(verdict) = self.check_unchanged(newest) {
+            return verdict;
+        }
+        if let Err(reason) = robot.plan(proposal) {
+            return Verdict::Refuse(Refusal::Robot { id, reason });
+        }
+        let proposal = Box::new(proposal.clone());
+        self.set_status(id, ProposalStatus::Moving);
+        self.moving = Some(id);
+        // After a stop or a fault an approval lets things go on.
+        self.automatic = !self.rules.require_approval;
+        Verdict::Act(GateAction::Move(proposal))
+    }
+
+    fn reject(&mut self, id: ProposalId) -> Verdict {
+        match self.status(id) {
+            None => self.unknown(id),
+            Some(ProposalStatus::Pending) => {
+                self.set_status(id, ProposalStatus::Rejected);
+                Verdict::Report(StepOutcome::Rejected, "rejected by the operator".into())
+            }
+            Some(status) => Verdict::Refuse(Refusal::NotPending { id, status }),
+        }
+    }
+
+    /// A stop is honoured whatever proposal it names.
+    fn stop(&mut self, id: ProposalId) -> Verdict {
+        let withdrawn = self.close_pending(ProposalStatus::Withdrawn);
+        if self.moving.is_some() || self.homing {
+            return Verdict::Act(GateAction::Cancel);
+        }
+        match self.status(id) {
+            None => Verdict::Refuse(Refusal::NothingToStop { id }),
+            Some(ProposalStatus::Withdrawn) if withdrawn => Verdict::Report(
+                StepOutcome::Stopped,
+                "stopped by the operator; nothing was moving".into(),
+            ),
+            // After its result it concerns only the goal tracker.
+            Some(_) => Verdict::Nothing,
+        }
+    }
+
+    /// Checks that the newest heightmap shows what the proposal's own does.
+    fn check_unchanged(&self, newest: &Newest) -> Result<(), Verdict> {
+        let Proposal { id, stamp, .. } = newest.proposal;
+        let (Some(source), Some((latest_stamp, latest))) = (&newest.source_heightmap, &self.latest)
+        else {
+            return Err(Verdict::Wait(Refusal::NoSourceHeightmap { id, stamp }));
+        };
+        let stamp = *latest_stamp;
+        if source.workspace != latest.workspace {
+            return Err(Verdict::Refuse(Refusal::OtherWorkspace { id, stamp }));
+        }
+        // The first heightmap may have come after the proposal.
+        check_inside(&newest.proposal, Some(source.workspace))
+            .map_err(|reason| Verdict::Refuse(reason.into()))?;
+        let tolerance_m = self.rules.observation_tolerance_m;
+        let limit = self.rules.observation_changed_fraction;
+        let fraction = source.changed_fraction(latest, tolerance_m);
+        if fraction > limit {
+            return Err(Verdict::Refuse(Refusal::ObservationChanged {
+                id,
+                stamp,
+                fraction,
+                tolerance_m,
+                limit,
+            }));
+        }
+        Ok(())
+    }
+
+    /// Where a proposal stands; none if it is unknown or invalid.
+    pub fn status(&self, id: ProposalId) -> Option<ProposalStatus> {
+        let mut known = self.statuses.iter().rev();
+        known
+            .find(|(known, _)| *known == id)
+            .map(|(_, status)| *status)
+    }
+
+    fn set_status(&mut self, id: ProposalId, status: ProposalStatus) {
+        let mut known = self.statuses.iter_mut().rev();
+        if let Some((_, known)) = known.find(|(known, _)| *known == id) {
+            *known = status;
+        }
+    }
+
+    /// Says whether a proposal was pending.
+    fn close_pending(&mut self, status: ProposalStatus) -> bool {
+        let mut known = self.statuses.iter_mut().rev();
+        match known.find(|(_, known)| *known == ProposalStatus::Pending) {
+            Some((_, pending)) => {
+                *pending = status;
+                true
+            }
+            None => false,
+        }
+    }
+}
+
+impl GateRules {
+    /// Checks what can be checked of a proposal by itself.
+    fn check(&self, proposal: &Proposal) -> Result<(), InvalidProposal> {
+        let id = proposal.id;
+        if proposal.frame != self.frame {
+            return Err(InvalidProposal::Frame {
+                id,
+                actual: proposal.frame.clone(),
+                expected: self.frame.clone(),
+            });
+        }
+        let PickPlace { pick, place } = &proposal.action;
+        for (which, pose) in [("pick", pick), ("place", place)] {
+            let (x_m, y_m) = (pose.translation.x, pose.translation.y);
+            let yaw_rad = pose.rotation.angle();
+            if !(x_m.is_finite() && y_m.is_finite() && yaw_rad.is_finite()) {
+                return Err(InvalidProposal::NotFinite {
+                    id,
+                    which,
+                    x_m,
+                    y_m,
+                    yaw_rad,
+                });
+            }
+        }
+        let (settings, limits) = (&proposal.settings, &self.limits);
+        let ranges = [
+            ("clearance_m", settings.clearance_m, limits.clearance_m),
+            ("lift_m", settings.lift_m, limits.lift_m),
+            ("travel_m_s", settings.travel_m_s, limits.travel_m_s),
+            ("carry_m_s", settings.carry_m_s, limits.carry_m_s),
+            ("descend_m_s", settings.descend_m_s, limits.descend_m_s),
+            (
+                "acceleration_m_s2",
+                settings.acceleration_m_s2,
+                limits.acceleration_m_s2,
+            ),
+        ];
+        // Not a number fails both comparisons.
+        let mut ranges = ranges.into_iter();
+        match ranges.find(|(_, value, limit)| !(*value > 0.0 && value <= limit)) {
+            Some((name, value, limit)) => Err(InvalidProposal::Settings {
+                id,
+                name,
+                value,
+                limit,
+            }),
+            None => Ok(()),
+        }
+    }
+}
+
+/// Checks that both poses lie on the heightmap, once one is known.
+fn check_inside(proposal: &Proposal, workspace: Option<Workspace>) -> Result<(), InvalidProposal> {
+    let Some(workspace) = workspace else {
+        return Ok(());
+    };
+    let PickPlace { pick, place } = &proposal.action;
+    let mut poses = [("pick", pick), ("place", place)].into_iter();
+    let outside = poses.find(|(_, pose)| {
+        let position = pose.translation.vector.into();
+        workspace.pixel(&position).is_none()
+    });
+    match outside {
+        Some((which, pose)) => Err(InvalidProposal::OutsideWorkspace {
+            id: proposal.id,
+            which,
+            x_m: pose.translation.x,
+            y_m: pose.translation.y,
+            workspace: Box::new(workspace),
+        }),
+        None => Ok(()),
+    }
+}
+
+fn seconds(stamp: Duration) -> String {
+    format!("{:.3} s", stamp.as_secs_f64())
+}

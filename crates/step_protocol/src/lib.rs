@@ -1,0 +1,33 @@
+//! The protocol of a step: goal, proposal, approval, motion, result, confirmation.
+//!
+//! Four state machines, one for each party: [`GoalTracker`] says which goal is next, [`ProposalPlanner`] when to propose,
+//! [`ApprovalGate`] what may move, [`Operator`] which question is due. They know no ROS, no network and no clock: nodes convert
+//! messages, call, and publish what comes back.
+
+mod gate;
+mod goals;
+mod mutation;
+mod operator;
+mod planner;
+mod tracker;
+mod types;
+
+#[cfg(test)]
+mod tests;
+
+pub use gate::{
+    ApprovalGate, GateAction, GateRules, InvalidProposal, Proposed, Refusal, Report, RobotState,
+};
+pub use goals::{
+    FAILED_PICK_RADIUS_M, FailedPicks, GoalSequence, Judgement, NoGoals, ReachedGoals, ShownStep,
+    goal_steps, goals_of,
+};
+pub use operator::{Operator, Question};
+pub use planner::{Job, PlannerRules, Prediction, ProposalPlanner};
+pub use tracker::{
+    Capture, CaptureError, Change, ConfirmationRefusal, GoalTracker, NoSuchStep, StepJudge,
+};
+pub use types::{
+    Confirmation, Goal, Observation, OperatorDecision, Proposal, ProposalId, ProposalStatus,
+    Reward, StepOutcome, StepResult, yaw_rad,
+};

@@ -1,0 +1,89 @@
+//! Faults planted on purpose, in tests only: the property test has to find each of them.
+
+/// A fault in one of the machines.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) enum Mutation {
+    /// The gate does not remember that a proposal was carried out.
+    ApprovalMovesTwice,
+    /// A superseded proposal can still be approved.
+    SupersededStaysPending,
+    /// Approvals that wait for their proposal survive a stop.
+    WaitingSurvivesStop,
+    /// Approvals that wait for their proposal survive a deactivation.
+    WaitingSurvivesDeactivation,
+    /// Any approval moves the newest proposal.
+    AnyApprovalMovesNewest,
+    /// An approval while the arm moves is accepted.
+    MovesWhileMoving,
+    /// A decision that waits for its result is lost when another proposal comes.
+    SupersessionDropsDecision,
+    /// A decision counts before the arm has moved.
+    AdvanceWithoutMotion,
+    /// A repeated result counts once more.
+    ResultCountsTwice,
+    /// The planner forgets an approval when a second one is refused.
+    RefusalReopensMoving,
+    /// The operator forgets a motion when another proposal comes before its reward.
+    OperatorForgetsMotion,
+    /// A refused proposal is never made anew.
+    RefusedIsNotRenewed,
+}
+
+impl Mutation {
+    /// All of them.
+    #[cfg(test)]
+    pub(crate) const ALL: [Self; 12] = [
+        Self::ApprovalMovesTwice,
+        Self::SupersededStaysPending,
+        Self::WaitingSurvivesStop,
+        Self::WaitingSurvivesDeactivation,
+        Self::AnyApprovalMovesNewest,
+        Self::MovesWhileMoving,
+        Self::SupersessionDropsDecision,
+        Self::AdvanceWithoutMotion,
+        Self::ResultCountsTwice,
+        Self::RefusalReopensMoving,
+        Self::OperatorForgetsMotion,
+        Self::RefusedIsNotRenewed,
+    ];
+}
+
+#[cfg(not(test))]
+pub(crate) const fn planted(_: Mutation) -> bool {
+    false
+}
+
+#[cfg(test)]
+thread_local! {
+    static PLANTED: std::cell::Cell<Option<Mutation>> = const { std::cell::Cell::new(None) };
+}
+
+#[cfg(test)]
+pub(crate) fn planted(mutation: Mutation) -> bool {
+    PLANTED.get() == Some(mutation)
+}
+
+/// Plants a fault in the machines of this thread, or none.
+#[cfg(test)]
+pub(crate) fn plant(mutation: Option<Mutation>) {
+    PLANTED.set(mutation);
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn one_fault_at_a_time_is_planted() {
+        for mutation in Mutation::ALL {
+            plant(Some(mutation));
+            let found: Vec<_> = Mutation::ALL
+                .into_iter()
+                .filter(|one| planted(*one))
+                .collect();
+            assert_eq!(found, [mutation]);
+        }
+        plant(None);
+        assert!(!Mutation::ALL.into_iter().any(planted));
+    }
+}

@@ -1,0 +1,4 @@
+mod gate;
+mod operator;
+mod planner;
+mod tracker;

@@ -55,6 +55,7 @@ fn demonstration() -> Demonstration {
     Demonstration {
         problem: "placing".into(),
         seed: 0,
+        start_seed: 0,
         steps: (0..9).map(step).collect(),
         last: observation(9),
     }

@@ -30,8 +30,10 @@ pub struct DemonstrationStep {
 pub struct Demonstration {
     /// Name of the problem.
     pub problem: String,
-    /// Seed of the episode.
+    /// Seed of the scene: fixtures, objects and goal.
     pub seed: u64,
+    /// Seed of the start: where the loose objects lay. That of the scene for the scene's own start.
+    pub start_seed: u64,
     /// The steps.
     pub steps: Vec<DemonstrationStep>,
     /// The workspace after the last step.
@@ -129,6 +131,15 @@ impl Demonstration {
             .collect()
     }
 
+    /// For people: problem, seed of the scene, and that of the start where it is not the scene's own.
+    pub fn name(&self) -> String {
+        let mut name = format!("{}/{}", self.problem, self.seed);
+        if self.start_seed != self.seed {
+            name += &format!("/{}", self.start_seed);
+        }
+        name
+    }
+
     /// The workspace before step `index`, from 0; after the last step for any larger one.
     pub fn observation(&self, index: usize) -> &Heightmap {
         self.steps
@@ -151,6 +162,7 @@ impl Demonstration {
         let mut bag = BagWriter::create(path, compression)?;
         bag.note("problem", &self.problem);
         bag.note("seed", self.seed);
+        bag.note("start_seed", self.start_seed);
         let heightmaps = bag.add::<sctn_msgs::Heightmap>(HEIGHTMAP, Qos::LATCHED)?;
         let goals = bag.add::<sctn_msgs::Goal>(GOAL, Qos::LATCHED)?;
         let actions = bag.add::<sctn_msgs::PickPlace>(PICK_PLACE, Qos::RELIABLE)?;
@@ -187,7 +199,7 @@ impl Demonstration {
                 let message = sctn_msgs::Goal {
                     header: header.clone(),
                     problem: self.problem.clone(),
-                    demonstration: format!("{}/{}", self.problem, self.seed),
+                    demonstration: self.name(),
                     step: number,
                     step_count: self.steps.len() as u32,
                     module: step.module.clone(),
@@ -259,6 +271,11 @@ impl Demonstration {
         let seed = note("seed")
             .and_then(|seed| seed.parse().ok())
             .ok_or_else(|| bad("seed", "a seed"))?;
+        // Bags of before there were other starts have no such note.
+        let start_seed = match note("start_seed") {
+            None => seed,
+            Some(start) => start.parse().map_err(|_| bad("start_seed", "a seed"))?,
+        };
 
         let mut messages = Steps {
             path,
@@ -299,6 +316,7 @@ impl Demonstration {
         Ok(Self {
             problem,
             seed,
+            start_seed,
             steps,
             last: observation,
         })

@@ -202,10 +202,12 @@ impl Demonstration {
             });
         }
         let seed = bag.notes().get("seed").and_then(|seed| seed.parse().ok());
+        let seed = seed.unwrap_or(0);
         let demonstration = Self {
             problem,
             // Of a real cell there is none.
-            seed: seed.unwrap_or(0),
+            seed,
+            start_seed: seed,
             steps,
             last: heightmaps[&last].clone(),
         };

@@ -68,6 +68,7 @@ fn demonstration(seed: u64, rewards: &[f64]) -> Demonstration {
     Demonstration {
         problem: "placing".into(),
         seed,
+        start_seed: seed / 3,
         steps: steps.collect(),
         last: observation(!seed),
     }
@@ -151,6 +152,27 @@ fn the_rest_of_a_killed_run_is_replaced_and_a_whole_bag_is_not() {
 }
 
 #[test]
+fn a_bag_that_names_no_start_shows_the_own_start_of_its_scene() {
+    let folder = TempDir::new().unwrap();
+    let path = folder.path().join("000006");
+    demonstration(6, &[1.0]).write(&path).unwrap();
+    let metadata = path.join("metadata.yaml");
+    let text = std::fs::read_to_string(&metadata).unwrap();
+    let lines: Vec<_> = text.lines().collect();
+    let old: Vec<_> = lines
+        .iter()
+        .filter(|line| !line.contains("start_seed"))
+        .collect();
+    assert_eq!(old.len(), lines.len() - 1);
+    let old: String = old.iter().map(|line| format!("{line}\n")).collect();
+    std::fs::write(&metadata, old).unwrap();
+    let read = read(&path).unwrap();
+    assert_eq!((read.seed, read.start_seed), (6, 6));
+    assert_eq!(read.name(), "placing/6");
+    assert_eq!(demonstration(6, &[1.0]).name(), "placing/6/2");
+}
+
+#[test]
 fn a_bag_without_a_demonstration_says_what_is_missing() {
     let folder = TempDir::new().unwrap();
     let refusal = |name: &str, fill: &dyn Fn(&mut BagWriter)| {
@@ -172,6 +194,15 @@ fn a_bag_without_a_demonstration_says_what_is_missing() {
     assert!(
         seed.ends_with("custom_data.seed is Some(\"x\"), expected a seed"),
         "{seed}"
+    );
+    let start = refusal("start", &|bag| {
+        bag.note("problem", "placing");
+        bag.note("seed", 1);
+        bag.note("start_seed", "-2");
+    });
+    assert!(
+        start.ends_with("custom_data.start_seed is Some(\"-2\"), expected a seed"),
+        "{start}"
     );
     let notes = |bag: &mut BagWriter| {
         bag.note("problem", "placing");

@@ -7,8 +7,8 @@ use anyhow::{Context, Result, bail};
 use bags::Demonstration;
 use clap::Args;
 use cpu_time::ProcessTime;
-use learning::{demonstrate, demonstration_path, wilson_95};
-use multiravens::{Environment, Problem};
+use learning::{demonstrate, demonstrate_in_order, demonstration_path, replay, wilson_95};
+use multiravens::{Environment, EpisodeSeed, Problem};
 use serde::Serialize;
 use std::path::{Path, PathBuf};
 use std::sync::Mutex;
@@ -27,11 +27,15 @@ pub struct Demos {
     /// Seed of the first episode; the next ones are seed + 2, seed + 4, ... (training even, validation odd)
     #[arg(long, required_unless_present = "gallery")]
     seed: Option<u64>,
+    /// Demonstrations of each scene, with the same fixtures and goal: the first from its own start, the others from the
+    /// starts SEED + 2, SEED + 4, ..., with the goals reached in the same order
+    #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u64).range(1..=1000))]
+    starts: u64,
     /// Draw instead, into this folder: the problem [default: all], its demonstration of the seed
     /// [default: 0] as pictures and an animation
     #[arg(long, conflicts_with_all = ["episodes", "out", "threads", "json"])]
     gallery: Option<PathBuf>,
-    /// Folder for the bags, DIR/PROBLEM/SEED each; those already there are kept [default: none are written]
+    /// Folder for the bags, DIR/PROBLEM/SEED each, or DIR/PROBLEM/SEED_START from another start; those already there are kept [default: none are written]
     #[arg(long)]
     out: Option<PathBuf>,
     /// Threads [default: one per core]
@@ -46,11 +50,14 @@ pub struct Demos {
 #[derive(Serialize)]
 struct Report {
     problem: String,
-    /// Episodes tried.
+    /// Episodes tried: scenes times starts.
     episodes: u64,
-    /// Share of episodes in which the demonstrator completed every module.
+    /// Share of episodes in which the demonstrator completed every module, in the same order as from the first
+    /// start of the scene that it completed.
     success: f64,
     interval_95: [f64; 2],
+    /// The same for each start: the scene's own, then the others.
+    success_by_start: Vec<f64>,
     /// Steps of the successful episodes.
     steps: u64,
     /// Bytes of their bags.
@@ -60,6 +67,8 @@ struct Report {
 }
 
 struct Episode {
+    /// Number of the start, from 0: the scene's own.
+    start: u64,
     complete: bool,
     steps: u64,
     bytes: u64,
@@ -78,7 +87,7 @@ impl Demos {
         let work_cell = root.work_cell()?;
         let cores = std::thread::available_parallelism().map_or(1, |cores| cores.get());
         let threads = self.threads.unwrap_or(cores).max(1);
-        let bar = progress::bar(count, "demonstrations");
+        let bar = progress::bar(count * self.starts, "demonstrations");
         let started = ProcessTime::now();
         let next = AtomicU64::new(0);
         let stop = AtomicBool::new(false);
@@ -90,15 +99,18 @@ impl Demos {
                 if index >= count {
                     break;
                 }
-                let seed = first_seed + 2 * index;
-                let episode = self
-                    .episode(&mut environment, seed)
-                    .inspect_err(|_| stop.store(true, Ordering::Relaxed))?;
-                episodes
-                    .lock()
-                    .expect("no thread panics with the lock")
-                    .push(episode);
-                bar.inc(1);
+                let scene = first_seed + 2 * index;
+                let mut order = None;
+                for start in 0..self.starts {
+                    let episode = self
+                        .episode(&mut environment, scene, start, &mut order)
+                        .inspect_err(|_| stop.store(true, Ordering::Relaxed))?;
+                    episodes
+                        .lock()
+                        .expect("no thread panics with the lock")
+                        .push(episode);
+                    bar.inc(1);
+                }
             }
             Ok(())
         };
@@ -117,11 +129,19 @@ impl Demos {
             .expect("no thread panics with the lock");
         let kept = episodes.iter().filter(|episode| episode.complete);
         let successes = kept.clone().count();
+        let complete = |start| {
+            kept.clone()
+                .filter(|episode| episode.start == start)
+                .count()
+        };
         let report = Report {
             problem: problem.name().to_owned(),
-            episodes: count,
-            success: successes as f64 / count.max(1) as f64,
+            episodes: count * self.starts,
+            success: successes as f64 / episodes.len().max(1) as f64,
             interval_95: wilson_95(successes, episodes.len()),
+            success_by_start: (0..self.starts)
+                .map(|start| complete(start) as f64 / count.max(1) as f64)
+                .collect(),
             steps: kept.clone().map(|episode| episode.steps).sum(),
             bytes: kept.map(|episode| episode.bytes).sum(),
             cpu_seconds: started.elapsed().as_secs_f64(),
@@ -144,40 +164,65 @@ impl Demos {
         Ok(())
     }
 
-    /// Makes the demonstration of a seed, or takes the one that an earlier run has finished.
-    fn episode(&self, environment: &mut Environment, seed: u64) -> Result<Episode> {
+    /// Makes the demonstration of a scene from one of its starts, or takes the one that an earlier run has
+    /// finished. The first complete one of a scene sets the order of the goals; one that reaches them in
+    /// another order, or loses one on the way, does not count.
+    fn episode(
+        &self,
+        environment: &mut Environment,
+        scene: u64,
+        start: u64,
+        order: &mut Option<Vec<usize>>,
+    ) -> Result<Episode> {
+        let seed = EpisodeSeed {
+            scene,
+            start: scene + 2 * start,
+        };
         let problem = environment.problem().name().to_owned();
-        let path = self
-            .out
-            .as_ref()
-            .map(|out| demonstration_path(out, &problem, seed));
+        let context = || format!("{problem}, seed {seed}");
+        let path = self.out.as_ref();
+        let path = path.map(|out| demonstration_path(out, &problem, seed));
+        let mut episode = Episode {
+            start,
+            complete: true,
+            steps: 0,
+            bytes: 0,
+        };
         if let Some(path) = &path
             && path.exists()
         {
             let found = Demonstration::read(path)
                 .with_context(|| format!("{}: remove it to make it anew", path.display()))?;
-            return Ok(Episode {
-                complete: true,
-                steps: found.steps.len() as u64,
-                bytes: size(path)?,
-            });
+            if self.starts > 1 && order.is_none() {
+                let replayed = replay(environment, &found).with_context(context)?;
+                *order = replayed.goal_order();
+            }
+            episode.steps = found.steps.len() as u64;
+            episode.bytes = size(path)?;
+            return Ok(episode);
         }
-        let rollout =
-            demonstrate(environment, seed).with_context(|| format!("{problem}, seed {seed}"))?;
-        let mut bytes = 0;
-        if rollout.complete
-            && let Some(path) = &path
-        {
+        let known = order.as_deref().unwrap_or_default();
+        let rollout = demonstrate_in_order(environment, seed, known).with_context(context)?;
+        episode.complete = rollout.complete;
+        if self.starts > 1 && rollout.complete {
+            let reached = rollout.goal_order();
+            let follows = order.is_none() || reached == *order;
+            episode.complete = reached.is_some() && follows;
+            if episode.complete {
+                *order = reached;
+            }
+        }
+        if !episode.complete {
+            return Ok(episode);
+        }
+        episode.steps = rollout.demonstration.steps.len() as u64;
+        if let Some(path) = &path {
             let folder = path.parent().context("the bag's folder")?;
             std::fs::create_dir_all(folder).with_context(|| folder.display().to_string())?;
             rollout.demonstration.write(path)?;
-            bytes = size(path)?;
+            episode.bytes = size(path)?;
         }
-        Ok(Episode {
-            complete: rollout.complete,
-            steps: rollout.demonstration.steps.len() as u64,
-            bytes,
-        })
+        Ok(episode)
     }
 }
 
@@ -191,7 +236,12 @@ fn size(bag: &Path) -> Result<u64> {
 }
 
 /// The demonstration of a problem's seed; an error where the demonstrator fails on it.
-pub fn demonstration(problem: &Problem, work_cell: &WorkCell, seed: u64) -> Result<Demonstration> {
+pub fn demonstration(
+    problem: &Problem,
+    work_cell: &WorkCell,
+    seed: impl Into<EpisodeSeed>,
+) -> Result<Demonstration> {
+    let seed = seed.into();
     let mut environment = Environment::new(problem, work_cell);
     let rollout = demonstrate(&mut environment, seed)?;
     if !rollout.complete {

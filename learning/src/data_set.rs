@@ -5,6 +5,7 @@ use crate::sampling::{Sampling, SamplingError};
 use bags::{Demonstration, DemonstrationError};
 use gctn::{Goal, GoalConditioning, Sample};
 use heightmap::Heightmap;
+use multiravens::EpisodeSeed;
 use rand::{Rng, RngExt};
 use std::path::{Path, PathBuf};
 
@@ -81,9 +82,20 @@ pub enum DataSetError {
     Sampling(#[from] SamplingError),
 }
 
-/// Where the demonstration of a problem and seed lies within a folder of demonstrations.
-pub fn demonstration_path(directory: &Path, problem: &str, seed: u64) -> PathBuf {
-    directory.join(problem).join(format!("{seed:06}"))
+/// Where the demonstration of a problem and seed lies within a folder of demonstrations: in
+/// `PROBLEM/SCENE`, from another start in `PROBLEM/SCENE_START`.
+pub fn demonstration_path(
+    directory: &Path,
+    problem: &str,
+    seed: impl Into<EpisodeSeed>,
+) -> PathBuf {
+    let EpisodeSeed { scene, start } = seed.into();
+    let folder = directory.join(problem);
+    if scene == start {
+        folder.join(format!("{scene:06}"))
+    } else {
+        folder.join(format!("{scene:06}_{start:06}"))
+    }
 }
 
 /// The bag of a recorded run: the folder itself, or its subfolder `run` as `sctn launch --record` leaves it.
@@ -284,6 +296,7 @@ mod tests {
         Demonstration {
             problem: "placing".into(),
             seed: 0,
+            start_seed: 0,
             steps: steps.collect(),
             last: observation(delta_rewards.len()),
         }

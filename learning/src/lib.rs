@@ -22,7 +22,7 @@ pub use evaluation::{Attempt, EpisodeReport, Evaluation, EvaluationError, attemp
 pub use goal::{NextStepOracle, goal, known_images, reached};
 pub use interval::wilson_95;
 pub use recipe::{Recipe, RecipeError, Validation};
-pub use rollout::{Rollout, demonstrate, roll_out};
+pub use rollout::{Rollout, demonstrate, demonstrate_in_order, replay, roll_out};
 pub use sampling::{ModuleWeights, Sampling, SamplingError, StepWeights};
 pub use search::{Search, SearchError, Trial, TrialSnapshot};
 pub use sweep::{Run, RunResult, Score, SnapshotResult, Sweep, Test};

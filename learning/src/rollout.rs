@@ -2,7 +2,7 @@
 
 use bags::{Demonstration, DemonstrationStep};
 use heightmap::Heightmap;
-use multiravens::{Environment, EnvironmentError};
+use multiravens::{Environment, EnvironmentError, EpisodeSeed};
 use pick_place::PickPlace;
 
 /// A rollout and how it ended.
@@ -10,32 +10,82 @@ use pick_place::PickPlace;
 pub struct Rollout {
     /// What was seen and done.
     pub demonstration: Demonstration,
+    /// Goals reached after each step, numbered as in [`Environment::goals_reached`].
+    pub goals_reached: Vec<Vec<usize>>,
     /// Whether every goal was reached.
     pub complete: bool,
     /// Reward of the last state, 0..1.
     pub total_reward: f64,
 }
 
+impl Rollout {
+    /// The order in which the goals were reached, to be followed from another start. `None` where a
+    /// goal was lost again, or two were reached in one step: no other start can follow that.
+    pub fn goal_order(&self) -> Option<Vec<usize>> {
+        let mut order: Vec<usize> = Vec::new();
+        for reached in &self.goals_reached {
+            let lost = order.iter().any(|goal| !reached.contains(goal));
+            if lost || reached.len() > order.len() + 1 {
+                return None;
+            }
+            order.extend(reached.iter().find(|goal| !order.contains(goal)));
+        }
+        Some(order)
+    }
+}
+
 /// Begins the episode of a seed and lets the demonstrator act until it is over or it knows no action.
-pub fn demonstrate(environment: &mut Environment, seed: u64) -> Result<Rollout, EnvironmentError> {
+pub fn demonstrate(
+    environment: &mut Environment,
+    seed: impl Into<EpisodeSeed>,
+) -> Result<Rollout, EnvironmentError> {
+    demonstrate_in_order(environment, seed, &[])
+}
+
+/// [`demonstrate`], the goals reached in an order: that of another start, see [`Rollout::goal_order`].
+/// Goals that are not named come last.
+pub fn demonstrate_in_order(
+    environment: &mut Environment,
+    seed: impl Into<EpisodeSeed>,
+    order: &[usize],
+) -> Result<Rollout, EnvironmentError> {
     roll_out(
         environment,
         seed,
-        |environment, _| Ok(environment.demonstrate()),
+        |environment, _| {
+            environment.follow(order)?;
+            Ok(environment.demonstrate())
+        },
         |_| (),
     )
+}
+
+/// Repeats the actions of a demonstration of this problem from the same start: the same states come of
+/// it, and with them which goals each step reached, which a bag does not say.
+pub fn replay(
+    environment: &mut Environment,
+    demonstration: &Demonstration,
+) -> Result<Rollout, EnvironmentError> {
+    let seed = EpisodeSeed {
+        scene: demonstration.seed,
+        start: demonstration.start_seed,
+    };
+    let mut actions = demonstration.steps.iter().map(|step| step.action);
+    roll_out(environment, seed, |_, _| Ok(actions.next()), |_| ())
 }
 
 /// Begins the episode of a seed and takes the actions of `act`, which is shown the observation, until
 /// the episode is over or it gives none. `after` is told each delta reward.
 pub fn roll_out<E: From<EnvironmentError>>(
     environment: &mut Environment,
-    seed: u64,
+    seed: impl Into<EpisodeSeed>,
     mut act: impl FnMut(&mut Environment, &Heightmap) -> Result<Option<PickPlace>, E>,
     mut after: impl FnMut(f64),
 ) -> Result<Rollout, E> {
+    let seed = seed.into();
     environment.reset(seed)?;
     let mut steps = Vec::new();
+    let mut goals_reached = Vec::new();
     let mut observation = environment.observe()?.clone();
     while let (false, Some(settings)) = (environment.is_done(), environment.settings()) {
         let Some(action) = act(environment, &observation)? else {
@@ -51,15 +101,18 @@ pub fn roll_out<E: From<EnvironmentError>>(
             delta_reward: report.delta_reward,
             outcome: report.outcome,
         });
+        goals_reached.push(environment.goals_reached());
         after(report.delta_reward);
     }
     Ok(Rollout {
         demonstration: Demonstration {
             problem: environment.problem().name().to_owned(),
-            seed,
+            seed: seed.scene,
+            start_seed: seed.start,
             steps,
             last: observation,
         },
+        goals_reached,
         complete: environment.is_complete(),
         total_reward: environment.total_reward(),
     })

@@ -168,6 +168,7 @@ mod tests {
             start_from: None,
             training: TrainingConfig {
                 seed,
+                start_seed: seed,
                 steps: 6,
                 ..TrainingConfig::compact()
             },
@@ -212,6 +213,7 @@ mod tests {
             data.push(Demonstration {
                 problem: "placing".into(),
                 seed,
+                start_seed: seed,
                 steps: (0..4).map(step).collect(),
                 last: observation(9),
             })

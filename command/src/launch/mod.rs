@@ -8,13 +8,13 @@ use crate::demos::demonstration;
 use crate::plain_node::plain_node;
 use crate::root::Root;
 use anyhow::{Context as _, Result, bail};
-use bags::outcome_name;
+use bags::{Demonstration, outcome_name};
 use clap::Args;
 use graph::{Graph, Settings};
 use heightmap::Heightmap;
 use msgs::convert::heightmap_from_msg;
 use msgs::sctn_msgs::{Goal, PickPlace, Reward, StepConfirmation, StepResult};
-use multiravens::Environment;
+use multiravens::{Environment, EpisodeSeed};
 use node_kit::{Node, Qos, ns_from_stamp, wait_for_end};
 use operator::{Operator, OperatorKind, Question, automatic};
 use recording::{LAST_HEIGHTMAP, LAST_WORDS, RunRecorder};
@@ -41,6 +41,10 @@ pub struct Launch {
     /// Seed of the episode (test: from 10,000 up)
     #[arg(long)]
     seed: u64,
+    /// Start of the scene that the demonstration is shown from: the same fixtures and goal, the loose objects elsewhere
+    /// [default: the very start that is to be solved]
+    #[arg(long)]
+    demonstration_seed: Option<u64>,
     /// Who approves proposals and confirms steps
     #[arg(long, value_enum, default_value = "auto")]
     operator: OperatorKind,
@@ -100,10 +104,28 @@ impl Launch {
             );
         }
         std::fs::create_dir_all(&folder).with_context(|| folder.display().to_string())?;
-        println!("demonstrating {} with seed {}", self.problem, self.seed);
+        let shown_seed = EpisodeSeed {
+            scene: self.seed,
+            start: self.demonstration_seed.unwrap_or(self.seed),
+        };
+        println!("demonstrating {} with seed {shown_seed}", self.problem);
         let shown = folder.join("demonstration");
-        if !shown.exists() {
-            demonstration(&problem, &work_cell, self.seed)?.write(&shown)?;
+        if shown.exists() {
+            let found = Demonstration::read(&shown)?;
+            let expected = format!("{}, seed {shown_seed}", self.problem);
+            let seed = EpisodeSeed {
+                scene: found.seed,
+                start: found.start_seed,
+            };
+            let found = format!("{}, seed {seed}", found.problem);
+            if found != expected {
+                bail!(
+                    "{}: a demonstration of {found}, expected {expected}",
+                    shown.display()
+                );
+            }
+        } else {
+            demonstration(&problem, &work_cell, shown_seed)?.write(&shown)?;
         }
         let settings = Settings {
             problem: self.problem.clone(),

@@ -3,11 +3,11 @@
 use crate::cell::{Cell, CellError, Rehearsal, Watched};
 use crate::problem::Problem;
 use crate::render::RenderError;
+use crate::seed::{Draws, EpisodeSeed, stream};
 use crate::tasks::{Move, Task};
 use heightmap::{Fusion, FusionError, Heightmap, View, Workspace};
 use nalgebra::Isometry2;
 use pick_place::{ExecuteError, Outcome, PickPlace, PrimitiveSettings};
-use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use std::time::Duration;
 use ur5::WorkCell;
@@ -17,8 +17,8 @@ const DEMONSTRATOR_STREAM: u64 = 1 << 32;
 
 /// A problem in a simulated work cell.
 ///
-/// A seed gives the same scene, and the same actions the same states, bit for bit. The demonstrator
-/// draws from its own stream of random numbers.
+/// An [`EpisodeSeed`] gives the same scene and start, and the same actions the same states, bit for bit.
+/// The demonstrator draws from its own stream of random numbers.
 pub struct Environment {
     problem: Problem,
     cell: Cell,
@@ -26,7 +26,9 @@ pub struct Environment {
     demonstrator: ChaCha8Rng,
     /// What the demonstrator's last action does in the present state, if it has rehearsed it.
     foretold: Option<(PickPlace, Rehearsal)>,
-    seed: u64,
+    /// The order in which the demonstrator reaches the goals, if it is told one.
+    order: Vec<usize>,
+    seed: EpisodeSeed,
     steps: usize,
     fusion: Fusion,
     heightmap: Heightmap,
@@ -35,12 +37,13 @@ pub struct Environment {
 struct Progress {
     name: &'static str,
     task: Box<dyn Task>,
-    reached: usize,
+    /// Goals reached, by their index in the task, ascending.
+    reached: Vec<usize>,
 }
 
 impl Progress {
     fn is_complete(&self) -> bool {
-        self.reached == self.task.goal_count()
+        self.reached.len() == self.task.goal_count()
     }
 }
 
@@ -103,7 +106,15 @@ pub enum EnvironmentError {
         /// Name of the problem.
         problem: String,
         /// The seed.
-        seed: u64,
+        seed: EpisodeSeed,
+    },
+    /// An order of goals that this episode has not got.
+    #[error("order of goals {order:?}: expected each of 0 to {last} at most once", last = goals - 1)]
+    Order {
+        /// The order.
+        order: Vec<usize>,
+        /// Number of goals of the episode.
+        goals: usize,
     },
     /// The simulated hardware refused.
     #[error(transparent)]
@@ -126,31 +137,34 @@ impl Environment {
             problem: problem.clone(),
             cell: Cell::new(work_cell),
             tasks: Vec::new(),
-            demonstrator: ChaCha8Rng::seed_from_u64(0),
+            demonstrator: stream(0, DEMONSTRATOR_STREAM),
             foretold: None,
-            seed: 0,
+            order: Vec::new(),
+            seed: 0.into(),
             steps: 0,
             fusion: Fusion::default(),
             heightmap: Heightmap::new(Workspace::RAVENS),
         }
     }
 
-    /// Begins the episode of a seed.
-    pub fn reset(&mut self, seed: u64) -> Result<(), EnvironmentError> {
+    /// Begins the episode of a seed: a number alone is a scene with its own start.
+    pub fn reset(&mut self, seed: impl Into<EpisodeSeed>) -> Result<(), EnvironmentError> {
+        let seed = seed.into();
         self.seed = seed;
+        self.order.clear();
         self.steps = 0;
         self.tasks.clear();
         self.cell.clear();
         self.foretold = None;
-        self.demonstrator = stream(seed, DEMONSTRATOR_STREAM);
+        self.demonstrator = stream(seed.start, DEMONSTRATOR_STREAM);
         for (index, placement) in self.problem.modules().iter().enumerate() {
-            let mut rng = stream(seed, index as u64);
+            let mut draws = Draws::new(seed, index as u64);
             let world = self.cell.world_mut();
-            let task = placement.module.build(world, &placement.anchor, &mut rng);
+            let task = placement.module.build(world, &placement.anchor, &mut draws);
             self.tasks.push(Progress {
                 name: placement.name,
                 task,
-                reached: 0,
+                reached: Vec::new(),
             });
         }
         if !self.cell.settle()? {
@@ -158,7 +172,7 @@ impl Environment {
             return Err(EnvironmentError::Restless { problem, seed });
         }
         for progress in &mut self.tasks {
-            progress.reached = progress.task.reached(self.cell.world());
+            progress.reached = progress.task.goals_reached(self.cell.world());
         }
         Ok(())
     }
@@ -171,11 +185,32 @@ impl Environment {
         Ok(&self.heightmap)
     }
 
+    /// Tells the demonstrator, until the next reset, in which order to reach the goals, numbered as in
+    /// [`Self::goals_reached`]. Goals that are not named come last, in any order.
+    pub fn follow(&mut self, order: &[usize]) -> Result<(), EnvironmentError> {
+        let goals = self.goal_count();
+        let once = |(index, goal): (usize, &usize)| *goal < goals && !order[..index].contains(goal);
+        if !order.iter().enumerate().all(once) {
+            let order = order.to_vec();
+            return Err(EnvironmentError::Order { order, goals });
+        }
+        self.order = order.to_vec();
+        Ok(())
+    }
+
     /// The demonstrator's next action; `None` when it knows none.
     pub fn demonstrate(&mut self) -> Option<PickPlace> {
         let index = self.current()?;
-        let task = &mut self.tasks[index].task;
-        let Move { action, rehearsal } = task.demonstrate(&self.cell, &mut self.demonstrator)?;
+        let first = self.first_goal(index);
+        let progress = &mut self.tasks[index];
+        let goals = first..first + progress.task.goal_count();
+        let ordered = self.order.iter().filter(|goal| goals.contains(*goal));
+        let mut ordered = ordered.map(|goal| goal - first);
+        let next = ordered.find(|goal| !progress.reached.contains(goal));
+        let Move { action, rehearsal } =
+            progress
+                .task
+                .demonstrate(&self.cell, &mut self.demonstrator, next)?;
         self.foretold = rehearsal.map(|rehearsal| (action, rehearsal));
         Some(action)
     }
@@ -242,7 +277,7 @@ impl Environment {
         let before = self.total_reward();
         self.steps += 1;
         for progress in &mut self.tasks {
-            progress.reached = progress.task.reached(self.cell.world());
+            progress.reached = progress.task.goals_reached(self.cell.world());
         }
         let total_reward = self.total_reward();
         Assessment {
@@ -258,7 +293,7 @@ impl Environment {
         let shares = self
             .tasks
             .iter()
-            .map(|p| p.reached as f64 / p.task.goal_count() as f64);
+            .map(|p| p.reached.len() as f64 / p.task.goal_count() as f64);
         shares.sum::<f64>() / self.tasks.len().max(1) as f64
     }
 
@@ -287,6 +322,18 @@ impl Environment {
         self.tasks.iter().map(|p| p.task.goal_count()).sum()
     }
 
+    /// The goals that are reached, ascending: those of the first module count from 0, those of the next
+    /// one go on from there.
+    pub fn goals_reached(&self) -> Vec<usize> {
+        let mut first = 0;
+        let mut reached = Vec::new();
+        for progress in &self.tasks {
+            reached.extend(progress.reached.iter().map(|goal| first + goal));
+            first += progress.task.goal_count();
+        }
+        reached
+    }
+
     /// The module being solved: the first that is not complete.
     pub fn module(&self) -> Option<&'static str> {
         self.current().map(|index| self.tasks[index].name)
@@ -309,7 +356,7 @@ impl Environment {
     }
 
     /// The seed of this episode.
-    pub fn seed(&self) -> u64 {
+    pub fn seed(&self) -> EpisodeSeed {
         self.seed
     }
 
@@ -332,12 +379,12 @@ impl Environment {
     fn current(&self) -> Option<usize> {
         self.tasks.iter().position(|p| !p.is_complete())
     }
-}
 
-fn stream(seed: u64, stream: u64) -> ChaCha8Rng {
-    let mut rng = ChaCha8Rng::seed_from_u64(seed);
-    rng.set_stream(stream);
-    rng
+    /// Number of a module's first goal among those of all modules.
+    fn first_goal(&self, module: usize) -> usize {
+        let before = &self.tasks[..module];
+        before.iter().map(|p| p.task.goal_count()).sum()
+    }
 }
 
 /// Refuses poses that are not finite or not over the workspace.

@@ -42,6 +42,7 @@ fn demonstration() -> Demonstration {
     Demonstration {
         problem: "placing".into(),
         seed: 7,
+        start_seed: 7,
         steps: vec![step(0.0, 0.5), step(0.01, 0.0), step(0.02, 0.5)],
         last: heightmap(0.03),
     }

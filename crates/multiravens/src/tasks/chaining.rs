@@ -11,6 +11,7 @@
 use super::{Move, ParameterError, Task, TaskModule, at_height, check_range, rehearsed};
 use crate::cell::Cell;
 use crate::colors;
+use crate::seed::Draws;
 use crate::world::{BeadChain, Mobility, Part, Shape, World};
 use nalgebra::{Isometry2, Isometry3, Point2, Point3, Rotation2, Vector2};
 use pick_place::{PickPlace, PrimitiveSettings};
@@ -187,32 +188,30 @@ impl TaskModule for Chaining {
         &self,
         world: &mut World,
         anchor: &Isometry2<f64>,
-        rng: &mut ChaCha8Rng,
+        draws: &mut Draws,
     ) -> Box<dyn Task> {
-        Box::new(self.draw(world, anchor, rng))
+        Box::new(self.draw(world, anchor, draws))
     }
 }
 
 impl Chaining {
-    fn draw(
-        &self,
-        world: &mut World,
-        anchor: &Isometry2<f64>,
-        rng: &mut ChaCha8Rng,
-    ) -> ChainingTask {
+    fn draw(&self, world: &mut World, anchor: &Isometry2<f64>, draws: &mut Draws) -> ChainingTask {
         let pegs = Pegs {
-            distance_m: self.distances_m[rng.random_range(0..2)],
-            radius_m: self.radii_m[rng.random_range(0..2)],
+            distance_m: self.distances_m[draws.scene().random_range(0..2)],
+            radius_m: self.radii_m[draws.scene().random_range(0..2)],
         };
-        let turn = self.turn_rad * rng.random_range(-1.0..=1.0);
+        let turn = self.turn_rad * draws.scene().random_range(-1.0..=1.0);
         let frame =
             anchor * Isometry2::new(Vector2::zeros(), turn) * Isometry2::translation(0.0, OFFSET_M);
-        let width = rng.random_range(OVAL_WIDTH_M.0..OVAL_WIDTH_M.1);
-        let gap = rng.random_range(OVAL_GAP_M.0..OVAL_GAP_M.1);
-        let middle = Vector2::new(
-            rng.random_range(-OVAL_SHIFT_M..OVAL_SHIFT_M),
-            -pegs.radius_m - gap - width / 2.0,
-        );
+        let (width, middle) = draws.start(|rng| {
+            let width = rng.random_range(OVAL_WIDTH_M.0..OVAL_WIDTH_M.1);
+            let gap = rng.random_range(OVAL_GAP_M.0..OVAL_GAP_M.1);
+            let shift = rng.random_range(-OVAL_SHIFT_M..OVAL_SHIFT_M);
+            (
+                width,
+                Vector2::new(shift, -pegs.radius_m - gap - width / 2.0),
+            )
+        });
         let centers: Vec<_> = oval(pegs.bead_count(), width)
             .into_iter()
             .map(|p| (p + middle, BeadChain::BEAD_RADIUS_M))
@@ -312,16 +311,15 @@ impl ChainingTask {
             .unzip()
     }
 
-    /// Number of pegs wrapped.
-    fn wrapped(&self, world: &World) -> usize {
+    /// Indices in [`PEGS`] of those that are wrapped.
+    fn wrapped(&self, world: &World) -> Vec<usize> {
         let (beads, heights) = self.beads(world);
         if self.is_twisted(&beads) {
-            return 0;
+            return Vec::new();
         }
-        let wrapped = PEGS
-            .iter()
-            .filter(|peg| self.is_wrapped(**peg, &beads, &heights));
-        wrapped.count()
+        let pegs = PEGS.iter().enumerate();
+        let wrapped = pegs.filter(|(_, peg)| self.is_wrapped(**peg, &beads, &heights));
+        wrapped.map(|(index, _)| index).collect()
     }
 
     /// A move that may wrap a peg: which bead, and where it goes. The bead that belongs beyond the
@@ -417,23 +415,29 @@ impl Task for ChainingTask {
         poses.to_vec()
     }
 
-    fn reached(&mut self, world: &World) -> usize {
+    fn goals_reached(&mut self, world: &World) -> Vec<usize> {
         self.wrapped(world)
     }
 
     /// Two stages: lifts the bead that belongs beyond a peg over to there, for one peg, then for
     /// the other. Of a few such moves it takes the first that succeeds in rehearsals.
-    fn demonstrate(&mut self, cell: &Cell, rng: &mut ChaCha8Rng) -> Option<Move> {
+    fn demonstrate(
+        &mut self,
+        cell: &Cell,
+        rng: &mut ChaCha8Rng,
+        next: Option<usize>,
+    ) -> Option<Move> {
         let world = cell.world();
         let (beads, heights) = self.beads(world);
-        if self.wrapped(world) == PEGS.len() {
+        if self.wrapped(world).len() == PEGS.len() {
             return None;
         }
-        let open: Vec<_> = PEGS
-            .into_iter()
-            .filter(|peg| !self.is_wrapped(*peg, &beads, &heights))
-            .collect();
-        let open = if open.is_empty() { PEGS.to_vec() } else { open };
+        let candidates = next.map_or(PEGS.to_vec(), |next| vec![PEGS[next]]);
+        let open = candidates
+            .iter()
+            .filter(|peg| !self.is_wrapped(**peg, &beads, &heights));
+        let open: Vec<_> = open.copied().collect();
+        let open = if open.is_empty() { candidates } else { open };
         let pose = |p: Point2<f64>| Isometry2::new((self.frame * p).coords, 0.0);
         let guess = |index: usize, rng: &mut ChaCha8Rng| {
             let peg = *open.choose(rng)?;
@@ -443,13 +447,16 @@ impl Task for ChainingTask {
                 place: pose(place),
             })
         };
-        rehearsed(cell, &SETTINGS, rng, guess, |after| self.wrapped(after))
+        rehearsed(cell, &SETTINGS, rng, guess, next, |world| {
+            self.wrapped(world)
+        })
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::seed::EpisodeSeed;
     use crate::world::STEPS_PER_SECOND;
     use rand::SeedableRng;
     use std::collections::BTreeSet;
@@ -460,12 +467,11 @@ mod tests {
         Isometry3::translation(0.0, 0.0, 0.5)
     }
 
-    fn drawn(seed: u64) -> (World, ChainingTask) {
+    fn drawn(seed: impl Into<EpisodeSeed>) -> (World, ChainingTask) {
         let mut world = World::new(&away());
         let module = Chaining::default();
         let anchor = Isometry2::new(Vector2::new(0.5, 0.35), 0.0);
-        let mut rng = ChaCha8Rng::seed_from_u64(seed);
-        let task = module.draw(&mut world, &anchor, &mut rng);
+        let task = module.draw(&mut world, &anchor, &mut Draws::new(seed.into(), 0));
         (world, task)
     }
 
@@ -520,7 +526,7 @@ mod tests {
         rest(&mut world);
         assert_eq!(task.reached(&world), 2);
         let mut rng = ChaCha8Rng::seed_from_u64(0);
-        let next = task.demonstrate(&Cell::around(&world), &mut rng);
+        let next = task.demonstrate(&Cell::around(&world), &mut rng, None);
         assert!(next.is_none());
     }
 
@@ -674,7 +680,7 @@ mod tests {
         let before = world.state_hash();
         let actions = [0, 0, 1].map(|seed| {
             let mut rng = ChaCha8Rng::seed_from_u64(seed);
-            task.demonstrate(&Cell::around(&world), &mut rng)
+            task.demonstrate(&Cell::around(&world), &mut rng, None)
                 .map(|next| next.action)
         });
         assert_eq!(actions[0], actions[1]);

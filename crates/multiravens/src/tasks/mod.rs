@@ -1,6 +1,7 @@
 //! Task modules: one file each, and one line each in `task_modules!`.
 
 use crate::cell::{Cell, Rehearsal};
+use crate::seed::Draws;
 use crate::world::World;
 use nalgebra::{Isometry2, Isometry3, Vector2};
 use pick_place::{Outcome, PickPlace, PrimitiveSettings};
@@ -60,13 +61,11 @@ pub trait TaskModule: Send + Sync + fmt::Debug {
     /// the module's bodies at the start and in the goal.
     fn footprint_m(&self) -> Vector2<f64>;
 
-    /// Draws a task and adds its bodies to the world, about the anchor.
-    fn build(
-        &self,
-        world: &mut World,
-        anchor: &Isometry2<f64>,
-        rng: &mut ChaCha8Rng,
-    ) -> Box<dyn Task>;
+    /// Draws a task and adds its bodies to the world, about the anchor. Only where the loose bodies
+    /// lie may depend on the start: the same scene has the same bodies, in the same order, and the
+    /// same goals.
+    fn build(&self, world: &mut World, anchor: &Isometry2<f64>, draws: &mut Draws)
+    -> Box<dyn Task>;
 }
 
 /// A task of one episode.
@@ -83,13 +82,24 @@ pub trait Task: Send {
     /// Where things should be: what the reward looks at.
     fn goal_poses(&self) -> Vec<Isometry3<f64>>;
 
-    /// Number of goals reached, at most [`Self::goal_count`]. Called once on the settled start and
-    /// once after every step, in order, so that a task may remember what was reached before.
-    fn reached(&mut self, world: &World) -> usize;
+    /// The goals that are reached, by their index in [`Self::goal_poses`], ascending. Called once on
+    /// the settled start and once after every step, in order, so that a task may remember what was
+    /// reached before.
+    fn goals_reached(&mut self, world: &World) -> Vec<usize>;
+
+    /// Number of goals reached, at most [`Self::goal_count`].
+    fn reached(&mut self, world: &World) -> usize {
+        self.goals_reached(world).len()
+    }
 
     /// The next action of a stochastic demonstrator that sees the true state; nothing when there
-    /// is nothing left to do.
-    fn demonstrate(&mut self, cell: &Cell, rng: &mut ChaCha8Rng) -> Option<Move>;
+    /// is nothing left to do. With `next` it reaches for this goal, else for any that may come next.
+    fn demonstrate(
+        &mut self,
+        cell: &Cell,
+        rng: &mut ChaCha8Rng,
+        next: Option<usize>,
+    ) -> Option<Move>;
 }
 
 /// A demonstrator's action.
@@ -117,17 +127,23 @@ const REHEARSALS: usize = 2;
 const NOISE_M: f64 = 1e-3;
 
 /// For what cannot be foretold, a cable or a chain: carries out guesses on a copy of the cell until
-/// one reaches exactly one goal more, with noise and again with other noise. Of none, the best.
+/// one reaches exactly one goal more, the `next` one if there is one, with noise and again with other
+/// noise. If none does, the best.
 ///
-/// `guess` is told how many it has made before, and gives none when it has run out; `reached` looks at the world after a rehearsal.
+/// `guess` is told how many it has made before, and gives none when it has run out; `reached` says which goals are reached in a
+/// world, before the move and after a rehearsal.
 fn rehearsed(
     cell: &Cell,
     settings: &PrimitiveSettings,
     rng: &mut ChaCha8Rng,
     mut guess: impl FnMut(usize, &mut ChaCha8Rng) -> Option<PickPlace>,
-    reached: impl Fn(&World) -> usize,
+    next: Option<usize>,
+    reached: impl Fn(&World) -> Vec<usize>,
 ) -> Option<Move> {
-    let before = reached(cell.world());
+    let before = reached(cell.world()).len();
+    let succeeds = |after: &Vec<usize>| {
+        after.len() == before + 1 && next.is_none_or(|goal| after.contains(&goal))
+    };
     // By rehearsals that went well, and whether anything is gained.
     let mut best: Option<((usize, bool), Move)> = None;
     for index in 0..GUESSES {
@@ -148,10 +164,10 @@ fn rehearsed(
                 .filter(|rehearsal| rehearsal.outcome() == Outcome::Placed);
             let after = placed.map(|rehearsal| reached(rehearsal.world()));
             if index == 0 {
-                gains = after > Some(before);
+                gains = after.as_ref().is_some_and(|after| after.len() > before);
                 first.rehearsal = rehearsal;
             }
-            if after != Some(before + 1) {
+            if !after.as_ref().is_some_and(succeeds) {
                 break;
             }
             good += 1;

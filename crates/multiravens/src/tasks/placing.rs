@@ -9,6 +9,7 @@
 
 use super::{Move, ParameterError, Task, TaskModule, at_height, check_range};
 use crate::colors;
+use crate::seed::Draws;
 use crate::world::{BodyId, Mobility, Part, Shape, World};
 use nalgebra::{Isometry2, Isometry3, Point2, Vector2, Vector3};
 use pick_place::{PickPlace, PrimitiveSettings};
@@ -119,19 +120,14 @@ impl TaskModule for Placing {
         &self,
         world: &mut World,
         anchor: &Isometry2<f64>,
-        rng: &mut ChaCha8Rng,
+        draws: &mut Draws,
     ) -> Box<dyn Task> {
-        Box::new(self.draw(world, anchor, rng))
+        Box::new(self.draw(world, anchor, draws))
     }
 }
 
 impl Placing {
-    fn draw(
-        &self,
-        world: &mut World,
-        anchor: &Isometry2<f64>,
-        rng: &mut ChaCha8Rng,
-    ) -> PlacingTask {
+    fn draw(&self, world: &mut World, anchor: &Isometry2<f64>, draws: &mut Draws) -> PlacingTask {
         world.add(&Part {
             shape: Shape::Cuboid {
                 size_m: Vector3::new(PLATE_M, PLATE_M, PLATE_HEIGHT_M),
@@ -148,12 +144,12 @@ impl Placing {
         ];
         for (even, count, side, size, rgb) in parities {
             let big = match size {
-                Size::Random => rng.random_bool(0.5),
+                Size::Random => draws.scene().random_bool(0.5),
                 Size::Big => true,
                 Size::Small => false,
             };
             let radius_m = if big { BIG_RADIUS_M } else { SMALL_RADIUS_M };
-            for start in starts(count, radius_m, rng) {
+            for start in draws.start(|rng| starts(count, radius_m, rng)) {
                 let pose = anchor * Isometry2::translation(start.x, side * start.y);
                 let body = world.add(&Part {
                     shape: Shape::Cylinder {
@@ -273,28 +269,33 @@ impl Task for PlacingTask {
         poses.collect()
     }
 
-    fn reached(&mut self, world: &World) -> usize {
-        let reached = self
-            .cells
-            .iter()
-            .filter(|cell| self.holds_goal(cell, world));
-        reached.count()
+    fn goals_reached(&mut self, world: &World) -> Vec<usize> {
+        let cells = self.cells.iter().enumerate();
+        let reached = cells.filter(|(_, cell)| self.holds_goal(cell, world));
+        reached.map(|(index, _)| index).collect()
     }
 
     /// A random disk that is not placed yet and nothing lies on, to a random free cell of its
-    /// parity. The disk is gripped near its centre and set down so that its centre meets the cell's.
-    fn demonstrate(&mut self, cell: &crate::Cell, rng: &mut ChaCha8Rng) -> Option<Move> {
+    /// parity, or to the next one. The disk is gripped near its centre and set down so that its centre
+    /// meets the cell's.
+    fn demonstrate(
+        &mut self,
+        cell: &crate::Cell,
+        rng: &mut ChaCha8Rng,
+        next: Option<usize>,
+    ) -> Option<Move> {
         let world = cell.world();
         let mut moves = Vec::new();
         for disk in &self.disks {
             if self.is_placed(disk, world) || self.is_covered(disk, world) {
                 continue;
             }
-            let cells = self
-                .cells
-                .iter()
-                .filter(|cell| cell.even == disk.even && self.is_free(cell, disk, world));
-            let cells: Vec<_> = cells.collect();
+            let cells = self.cells.iter().enumerate().filter(|(index, cell)| {
+                next.is_none_or(|next| next == *index)
+                    && cell.even == disk.even
+                    && self.is_free(cell, disk, world)
+            });
+            let cells: Vec<_> = cells.map(|(_, cell)| cell).collect();
             if !cells.is_empty() {
                 moves.push((disk, cells));
             }
@@ -318,6 +319,7 @@ impl Task for PlacingTask {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::seed::EpisodeSeed;
     use proptest::prelude::*;
     use rand::SeedableRng;
 
@@ -327,12 +329,11 @@ mod tests {
         Isometry3::translation(0.0, 0.0, TIP_AWAY_M)
     }
 
-    fn scene(seed: u64) -> (World, PlacingTask) {
+    fn scene(seed: impl Into<EpisodeSeed>) -> (World, PlacingTask) {
         let mut world = World::new(&away());
         let placing = Placing::default();
         let anchor = Isometry2::new(Vector2::new(0.5, 0.05), 0.3);
-        let mut rng = ChaCha8Rng::seed_from_u64(seed);
-        let task = placing.draw(&mut world, &anchor, &mut rng);
+        let task = placing.draw(&mut world, &anchor, &mut Draws::new(seed.into(), 0));
         (world, task)
     }
 
@@ -366,7 +367,7 @@ mod tests {
             assert_eq!(task.reached(&world), count + 1);
         }
         let mut rng = ChaCha8Rng::seed_from_u64(0);
-        let next = task.demonstrate(&crate::Cell::around(&world), &mut rng);
+        let next = task.demonstrate(&crate::Cell::around(&world), &mut rng, None);
         assert!(next.is_none());
     }
 
@@ -454,8 +455,12 @@ mod tests {
 
     proptest! {
         #[test]
-        fn disks_start_apart_on_their_side_and_do_not_move(seed in 0u64..1_000_000) {
-            let (mut world, task) = scene(seed);
+        fn disks_start_apart_on_their_side_and_do_not_move(
+            scene_seed in 0u64..1_000_000,
+            start_after in 0u64..2,
+        ) {
+            let start = scene_seed + start_after;
+            let (mut world, task) = scene(EpisodeSeed { scene: scene_seed, start });
             let anchor = Isometry2::new(Vector2::new(0.5, 0.05), 0.3);
             let starts: Vec<_> = task.disks.iter().map(|d| world.position(d.body)).collect();
             for (i, a) in task.disks.iter().enumerate() {
@@ -480,7 +485,7 @@ mod tests {
             let (world, mut task) = scene(seed);
             let mut rng = ChaCha8Rng::seed_from_u64(seed);
             let cell = crate::Cell::around(&world);
-            let action = task.demonstrate(&cell, &mut rng).unwrap().action;
+            let action = task.demonstrate(&cell, &mut rng, None).unwrap().action;
             let pick = Point2::from(action.pick.translation.vector);
             let disk = task.disks.iter().find(|d| {
                 (world.position(d.body).xy() - pick).norm() <= 0.25 * d.radius_m + 1e-9

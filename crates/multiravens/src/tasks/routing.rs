@@ -11,13 +11,14 @@
 use super::{Move, ParameterError, Task, TaskModule, at_height, check_range, rehearsed};
 use crate::cell::Cell;
 use crate::colors;
+use crate::seed::Draws;
 use crate::world::{BeadChain, BodyId, Mobility, Part, Shape, World};
 use nalgebra::{Isometry2, Isometry3, Point2, Vector2};
 use pick_place::{PickPlace, PrimitiveSettings};
 use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
 use serde::Deserialize;
-use std::f64::consts::PI;
+use std::f64::consts::{PI, TAU};
 
 const PEG_RADIUS_M: f64 = 0.012;
 const PEG_HEIGHT_M: f64 = 0.03;
@@ -27,6 +28,15 @@ const ANCHOR_X_M: f64 = -0.2;
 const FIRST_X_M: f64 = -0.125;
 /// Distance of the cable's start from the pegs' middle line.
 const START_Y_M: f64 = -0.115;
+/// In another start than the scene's own the cable reaches that side this far along x from its
+/// anchor, ...
+const CORNER_M: (f64, f64) = (0.015, 0.05);
+/// ... lies in waves about a line this far from the middle line, ...
+const WAVES_Y_M: (f64, f64) = (-0.122, -0.112);
+/// ... which are at most so high, ...
+const WAVE_HEIGHT_M: f64 = 0.008;
+/// ... and so long.
+const WAVE_LENGTH_M: (f64, f64) = (0.12, 0.24);
 /// A bead's centre passes a peg's centre at this distance when it lies against the peg.
 const PASS_M: f64 = PEG_RADIUS_M + BeadChain::BEAD_RADIUS_M;
 /// The demonstrator leaves this much room between a bead and the peg it passes.
@@ -136,22 +146,18 @@ impl TaskModule for Routing {
         &self,
         world: &mut World,
         anchor: &Isometry2<f64>,
-        rng: &mut ChaCha8Rng,
+        draws: &mut Draws,
     ) -> Box<dyn Task> {
-        Box::new(self.draw(world, anchor, rng))
+        Box::new(self.draw(world, anchor, draws))
     }
 }
 
 impl Routing {
-    fn draw(
-        &self,
-        world: &mut World,
-        anchor: &Isometry2<f64>,
-        rng: &mut ChaCha8Rng,
-    ) -> RoutingTask {
+    fn draw(&self, world: &mut World, anchor: &Isometry2<f64>, draws: &mut Draws) -> RoutingTask {
         let (least, most) = self.pegs;
-        let count = rng.random_range(least..=most);
+        let count = draws.scene().random_range(least..=most);
         let spacing = if count == 2 { 0.15 } else { 0.105 };
+        let rng = draws.scene();
         let pegs: Vec<_> = (0..count)
             .map(|index| {
                 let side = if index % 2 == 0 { 1.0 } else { -1.0 };
@@ -188,7 +194,11 @@ impl Routing {
         let beads = ((to_last + reach.norm() + SLACK_M) / BeadChain::PITCH_M).ceil() as usize + 1;
         let free = (beads - 1) as f64 * BeadChain::PITCH_M - to_last - SLACK_M;
         let end = last + reach.normalize() * free;
-        let centers: Vec<_> = lay(start, beads)
+        let laid = match draws.other_start() {
+            None => lay(start, beads),
+            Some(rng) => lay_in_waves(start, beads, rng),
+        };
+        let centers: Vec<_> = laid
             .into_iter()
             .map(|p| {
                 let p = anchor * p;
@@ -240,6 +250,30 @@ fn lay(start: Point2<f64>, beads: usize) -> Vec<Point2<f64>> {
     };
     // Cutting the corner shortens one link a little; the solver closes that within a step.
     (0..beads).map(at).collect()
+}
+
+/// Beads at their pitch, from the anchor aslant to the cable's start side and on in waves along x.
+fn lay_in_waves(start: Point2<f64>, beads: usize, rng: &mut ChaCha8Rng) -> Vec<Point2<f64>> {
+    let corner_x = start.x + rng.random_range(CORNER_M.0..CORNER_M.1);
+    let middle = rng.random_range(WAVES_Y_M.0..WAVES_Y_M.1);
+    let height = rng.random_range(0.0..WAVE_HEIGHT_M);
+    let length = rng.random_range(WAVE_LENGTH_M.0..WAVE_LENGTH_M.1);
+    let phase = rng.random_range(0.0..TAU);
+    let on_wave = |x: f64| Point2::new(x, middle + height * (TAU * x / length + phase).sin());
+    let corner = on_wave(corner_x);
+    let mut at = start;
+    let mut laid = vec![start];
+    while laid.len() < beads {
+        let is_slanted = (corner - at).norm() > BeadChain::PITCH_M && at.x < corner_x;
+        let ahead = if is_slanted {
+            corner
+        } else {
+            on_wave(at.x + BeadChain::PITCH_M)
+        };
+        at += (ahead - at).normalize() * BeadChain::PITCH_M;
+        laid.push(at);
+    }
+    laid
 }
 
 impl RoutingTask {
@@ -392,18 +426,23 @@ impl Task for RoutingTask {
         poses.collect()
     }
 
-    fn reached(&mut self, world: &World) -> usize {
+    fn goals_reached(&mut self, world: &World) -> Vec<usize> {
         let beads = self.beads(world);
         let routed = self.routed(&beads);
         let next = self.pegs.get(routed);
         self.draws = next.is_none_or(|peg| self.passes(peg, &beads));
-        self.count(&beads)
+        (0..self.count(&beads)).collect()
     }
 
     /// Lifts the bead that belongs against the next peg over to its side of the peg, or draws the
     /// cable round a peg that it passes already; when all pegs are done, draws the end to its goal.
-    /// Of a few such moves it takes the first that succeeds in rehearsals.
-    fn demonstrate(&mut self, cell: &Cell, rng: &mut ChaCha8Rng) -> Option<Move> {
+    /// Of a few such moves it takes the first that succeeds in rehearsals. There is but one order.
+    fn demonstrate(
+        &mut self,
+        cell: &Cell,
+        rng: &mut ChaCha8Rng,
+        next: Option<usize>,
+    ) -> Option<Move> {
         let beads = self.beads(cell.world());
         if self.count(&beads) == self.goal_count() {
             return None;
@@ -423,30 +462,29 @@ impl Task for RoutingTask {
                 place: pose(goal + aside),
             })
         };
-        let count = |after: &World| self.count(&self.beads(after));
-        rehearsed(cell, &self.settings(), rng, guess, count)
+        let reached = |world: &World| (0..self.count(&self.beads(world))).collect();
+        rehearsed(cell, &self.settings(), rng, guess, next, reached)
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::seed::EpisodeSeed;
     use proptest::prelude::*;
-    use rand::SeedableRng;
 
     fn away() -> Isometry3<f64> {
         Isometry3::translation(0.0, 0.0, 0.5)
     }
 
-    fn scene(seed: u64, pegs: usize) -> (World, RoutingTask) {
+    fn scene(seed: impl Into<EpisodeSeed>, pegs: usize) -> (World, RoutingTask) {
         let mut world = World::new(&away());
         let routing = Routing {
             pegs: (pegs, pegs),
             ..Routing::default()
         };
         let anchor = Isometry2::new(Vector2::new(0.5, -0.3), 0.2);
-        let mut rng = ChaCha8Rng::seed_from_u64(seed);
-        let task = routing.draw(&mut world, &anchor, &mut rng);
+        let task = routing.draw(&mut world, &anchor, &mut Draws::new(seed.into(), 0));
         (world, task)
     }
 
@@ -575,10 +613,12 @@ mod tests {
         #![proptest_config(ProptestConfig::with_cases(64))]
         #[test]
         fn a_scene_fits_its_footprint_comes_to_rest_and_earns_nothing(
-            seed in 0u64..1_000_000,
+            scene_seed in 0u64..1_000_000,
+            start_after in 0u64..2,
             pegs in 2usize..=3,
         ) {
-            let (mut world, mut task) = scene(seed, pegs);
+            let start = scene_seed + start_after;
+            let (mut world, mut task) = scene(EpisodeSeed { scene: scene_seed, start }, pegs);
             for _ in 0..480 {
                 world.step(&away());
             }

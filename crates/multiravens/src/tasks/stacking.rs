@@ -10,6 +10,7 @@
 use super::{Move, ParameterError, Task, TaskModule, at_height, check_range};
 use crate::cell::Cell;
 use crate::colors;
+use crate::seed::Draws;
 use crate::world::{BodyId, Mobility, Part, Shape, World};
 use nalgebra::{Isometry2, Isometry3, Matrix1x3, Point2, Point3, UnitComplex, Vector2, Vector3};
 use pick_place::{PickPlace, PrimitiveSettings};
@@ -121,26 +122,22 @@ impl TaskModule for Stacking {
         &self,
         world: &mut World,
         anchor: &Isometry2<f64>,
-        rng: &mut ChaCha8Rng,
+        draws: &mut Draws,
     ) -> Box<dyn Task> {
-        Box::new(self.draw(world, anchor, rng))
+        Box::new(self.draw(world, anchor, draws))
     }
 }
 
 impl Stacking {
-    fn draw(
-        &self,
-        world: &mut World,
-        anchor: &Isometry2<f64>,
-        rng: &mut ChaCha8Rng,
-    ) -> StackingTask {
+    fn draw(&self, world: &mut World, anchor: &Isometry2<f64>, draws: &mut Draws) -> StackingTask {
         let shift = self.shift_m;
-        let mut near = |(x, y): (f64, f64)| {
+        let near = |(x, y): (f64, f64), rng: &mut ChaCha8Rng| {
             let mut off = || rng.random_range(-shift..=shift);
             Vector2::new(x + off(), y + off())
         };
-        let (stand_at, array_at) = (near(STAND_AT_M), near(ARRAY_AT_M));
-        let yaw_rad = f64::from(rng.random_range(0..8)) * FRAC_PI_4;
+        let stand_at = near(STAND_AT_M, draws.scene());
+        let array_at = draws.start(|rng| near(ARRAY_AT_M, rng));
+        let yaw_rad = f64::from(draws.scene().random_range(0..8)) * FRAC_PI_4;
         let stand = anchor * Isometry2::new(stand_at, yaw_rad);
         world.add(&Part {
             shape: Shape::Cuboid {
@@ -152,9 +149,14 @@ impl Stacking {
             rgb: colors::PLATE,
         });
         let mut colors = COLORS;
-        colors.shuffle(rng);
-        let blocks = colors.iter().enumerate().map(|(index, rgb)| {
-            let (row, col) = (index / 3, index % 3);
+        colors.shuffle(draws.scene());
+        // Place of each block in the array: in another start the colours lie in other places.
+        let mut slots = [0, 1, 2, 3, 4, 5];
+        if let Some(rng) = draws.other_start() {
+            slots.shuffle(rng);
+        }
+        let blocks = colors.iter().zip(slots).map(|(rgb, slot)| {
+            let (row, col) = (slot / 3, slot % 3);
             let at = Vector2::new(row as f64 - 0.5, col as f64 - 1.0) * ARRAY_PITCH_M + array_at;
             world.add(&Part {
                 shape: Shape::Cuboid {
@@ -171,7 +173,7 @@ impl Stacking {
         });
         let mut blocks: Vec<BodyId> = blocks.collect();
         // The array must not tell where its blocks go.
-        blocks.shuffle(rng);
+        blocks.shuffle(draws.scene());
         let rows = ROWS.iter().enumerate();
         let centers = rows.flat_map(|(row, (first, end))| {
             let z = STAND_M.2 + (row as f64 + 0.5) * BLOCK_M;
@@ -258,12 +260,11 @@ impl Task for StackingTask {
         poses.collect()
     }
 
-    fn reached(&mut self, world: &World) -> usize {
-        let mut reached = 0;
+    fn goals_reached(&mut self, world: &World) -> Vec<usize> {
+        let mut reached = Vec::new();
         for (first, end) in ROWS {
-            let row = self.goals[first..end].iter();
-            reached += row.filter(|goal| self.is_reached(goal, world)).count();
-            if reached < end {
+            reached.extend((first..end).filter(|goal| self.is_reached(&self.goals[*goal], world)));
+            if reached.len() < end {
                 break;
             }
         }
@@ -272,14 +273,23 @@ impl Task for StackingTask {
 
     /// A random block of the lowest row that is not complete, to its goal: gripped near the centre
     /// of its top, and turned no further than it takes.
-    fn demonstrate(&mut self, cell: &Cell, rng: &mut ChaCha8Rng) -> Option<Move> {
+    fn demonstrate(
+        &mut self,
+        cell: &Cell,
+        rng: &mut ChaCha8Rng,
+        next: Option<usize>,
+    ) -> Option<Move> {
         let world = cell.world();
+        let next = next.map(|next| self.goals[next].block);
         let row = self.row(world)?.iter().filter(|goal| {
             let block = world.position(goal.block);
             let covered = self.is_occupied(block.xy(), block.z, goal.block, world);
             let wanted = goal.center.z - BLOCK_M / 2.0;
             let occupied = self.is_occupied(goal.center.xy(), wanted, goal.block, world);
-            !self.is_reached(goal, world) && !covered && !occupied
+            next.is_none_or(|next| next == goal.block)
+                && !self.is_reached(goal, world)
+                && !covered
+                && !occupied
         });
         let row: Vec<_> = row.collect();
         let goal = row.choose(rng)?;
@@ -300,6 +310,7 @@ impl Task for StackingTask {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::seed::EpisodeSeed;
     use proptest::prelude::*;
     use rand::SeedableRng;
 
@@ -313,11 +324,10 @@ mod tests {
         Isometry2::new(Vector2::new(0.5, 0.3), 0.2)
     }
 
-    fn scene(seed: u64) -> (World, StackingTask) {
+    fn scene(seed: impl Into<EpisodeSeed>) -> (World, StackingTask) {
         let mut world = World::new(&away());
         let stacking = Stacking::default();
-        let mut rng = ChaCha8Rng::seed_from_u64(seed);
-        let task = stacking.draw(&mut world, &anchor(), &mut rng);
+        let task = stacking.draw(&mut world, &anchor(), &mut Draws::new(seed.into(), 0));
         (world, task)
     }
 
@@ -354,7 +364,7 @@ mod tests {
             assert_eq!(task.reached(&world), goal + 1);
         }
         let mut rng = ChaCha8Rng::seed_from_u64(0);
-        let next = task.demonstrate(&Cell::around(&world), &mut rng);
+        let next = task.demonstrate(&Cell::around(&world), &mut rng, None);
         assert!(next.is_none());
     }
 
@@ -379,7 +389,7 @@ mod tests {
         assert_eq!(task.reached(&world), 2);
         // Nor is there a way to go on but to take the tower down.
         let mut rng = ChaCha8Rng::seed_from_u64(0);
-        let next = task.demonstrate(&Cell::around(&world), &mut rng);
+        let next = task.demonstrate(&Cell::around(&world), &mut rng, None);
         assert!(next.is_none());
         // Floating where it should be, with nothing below.
         let (mut world, mut task) = scene(4);
@@ -444,6 +454,26 @@ mod tests {
     }
 
     #[test]
+    fn another_start_wants_the_same_colours_which_lie_in_other_slots() {
+        let drawn = |start| {
+            let (world, task) = scene(EpisodeSeed { scene: 3, start });
+            let rgb: Vec<_> = task.goals.iter().map(|g| world.rgb(g.block)).collect();
+            let at = task.goals.iter().map(|g| world.position(g.block));
+            (rgb, at.collect::<Vec<_>>())
+        };
+        let (rgb, own) = drawn(3);
+        for start in 4..10 {
+            let (other_rgb, other) = drawn(start);
+            assert_eq!(other_rgb, rgb, "start {start}");
+            let moved = own
+                .iter()
+                .zip(&other)
+                .filter(|(a, b)| (*a - *b).norm() > BLOCK_M);
+            assert!(moved.count() >= 2, "start {start}");
+        }
+    }
+
+    #[test]
     fn every_stand_yaw_and_many_colour_orders_occur() {
         let drawn = (0..100).map(|seed| {
             let (world, task) = scene(seed);
@@ -465,8 +495,12 @@ mod tests {
 
     proptest! {
         #[test]
-        fn blocks_start_apart_within_the_footprint_and_do_not_move(seed in 0u64..1_000_000) {
-            let (mut world, task) = scene(seed);
+        fn blocks_start_apart_within_the_footprint_and_do_not_move(
+            scene_seed in 0u64..1_000_000,
+            start_after in 0u64..2,
+        ) {
+            let start = scene_seed + start_after;
+            let (mut world, task) = scene(EpisodeSeed { scene: scene_seed, start });
             let half = Vector2::new(FOOTPRINT_M.0, FOOTPRINT_M.1) / 2.0;
             let starts: Vec<_> = task.goals.iter().map(|g| world.position(g.block)).collect();
             let reach = BLOCK_M / 2f64.sqrt();
@@ -494,7 +528,7 @@ mod tests {
             let (mut world, mut task) = scene(seed);
             let mut rng = ChaCha8Rng::seed_from_u64(seed);
             let cell = Cell::around(&world);
-            let action = task.demonstrate(&cell, &mut rng).unwrap().action;
+            let action = task.demonstrate(&cell, &mut rng, None).unwrap().action;
             let turn = action.place.rotation.angle();
             prop_assert!(turn.abs() < FRAC_PI_4 + 0.01);
             let goal = task.goals[..3].iter().find(|goal| {

@@ -80,11 +80,14 @@ def test_an_exported_run_is_what_the_bag_says(start, run: pathlib.Path, tmp_path
     }
     for name, feature in info["features"].items():
         expected = arrow[feature["dtype"]]
-        expected = expected if feature["shape"] in ([1], [320, 160, 3]) else pa.list_(expected)
+        nested = {"image": 0}.get(feature["dtype"], 0 if feature["shape"] == [1] else len(feature["shape"]))
+        for _ in range(nested):
+            expected = pa.list_(expected)
         assert schema.field(name) == pa.field(name, expected), name
     declared = json.loads(schema.metadata[b"huggingface"])["info"]["features"]
     assert set(declared) == set(info["features"])
     assert declared["observation.images.workspace"] == {"_type": "Image"}
+    assert declared["observation.goal_height_m"] == {"shape": [320, 160], "dtype": "float32", "_type": "Array2D"}
     table = pyarrow.parquet.read_table(out / path).to_pylist()
     assert set(table[0]) == set(info["features"])
     assert 6 <= len(table) == episodes[0]["length"]
@@ -105,6 +108,15 @@ def test_an_exported_run_is_what_the_bag_says(start, run: pathlib.Path, tmp_path
         assert step.with_name(step.name + "_observation.png").read_bytes() == picture
         heights = np.load(step.with_name(step.name + "_height_m.npy"))
         assert np.array_equal(heights.ravel(), seen.height_m)
+        assert np.array_equal(np.array(row["observation.height_m"], dtype=np.float32), heights)
+        # A step's goal is what the next step begins with.
+        if index + 1 < len(table):
+            assert row["observation.images.goal"]["bytes"] == table[index + 1]["observation.images.workspace"]["bytes"]
+            assert row["observation.goal_height_m"] == table[index + 1]["observation.height_m"]
+    folder = out / "steps/episode_000000"
+    assert table[-1]["observation.images.goal"]["bytes"] == (folder / "last_observation.png").read_bytes()
+    last_heights = np.array(table[-1]["observation.goal_height_m"], dtype=np.float32)
+    assert np.array_equal(last_heights, np.load(folder / "last_height_m.npy"))
     rows = table + pyarrow.parquet.read_table(out / second).to_pylist()
     assert [row["index"] for row in rows] == list(range(sum(lengths)))
     stats = json.loads((out / "meta/stats.json").read_text())
@@ -114,6 +126,8 @@ def test_an_exported_run_is_what_the_bag_says(start, run: pathlib.Path, tmp_path
         assert np.allclose(stats["action"][name], of(actions, axis=0), atol=1e-5), name
     assert stats["action"]["count"] == [len(rows)]
     assert np.shape(stats["observation.images.workspace"]["mean"]) == (3, 1, 1)
+    heights = np.array([row["observation.height_m"] for row in rows])
+    assert np.allclose(stats["observation.height_m"]["mean"], [[heights.mean()]], atol=1e-5)
 
 
 def test_the_bag_of_a_run_shows_its_last_heightmap_steps_and_rewards(start, run: pathlib.Path) -> None:

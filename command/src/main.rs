@@ -15,7 +15,6 @@ mod interfaces;
 mod latency;
 mod launch;
 mod picture;
-mod plain_node;
 mod progress;
 mod root;
 mod search;

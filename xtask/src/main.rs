@@ -3,6 +3,8 @@
 mod check;
 mod command;
 mod demo;
+#[cfg(test)]
+mod documents;
 mod layers;
 mod libtorch;
 mod licences;

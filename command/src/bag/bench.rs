@@ -1,13 +1,13 @@
 //! `sctn bag bench`: the writer beside the disk, and a recording of three cameras.
 
 use super::DAMAGED;
-use crate::plain_node::plain_node;
 use anyhow::{Context as _, Result, bail};
 use bags::{BagReader, BagWriter, Compression, Qos};
 use clap::Args;
 use msgs::sensor_msgs::Image;
 use msgs::{ByteBuf, Interface, to_cdr};
 use node_kit::RawQos;
+use node_kit::plain_node;
 use serde_json::{Value, json};
 use std::fs::File;
 use std::io::Write;

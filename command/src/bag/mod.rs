@@ -4,7 +4,6 @@ mod bench;
 mod export;
 mod play;
 mod record;
-pub mod recorder;
 
 use anyhow::{Context, Result};
 use bags::{BagInfo, Compression, Findings, recover, verify};
@@ -14,7 +13,7 @@ use std::process::ExitCode;
 use std::time::{Duration, SystemTime, UNIX_EPOCH};
 
 /// The bag is damaged, or something had to be left out. 1 is for what could not be done, 2 for a wrong command line.
-pub const DAMAGED: u8 = 3;
+const DAMAGED: u8 = 3;
 /// Findings that are shown to a person; `--json` has more.
 const SHOWN: usize = 20;
 
@@ -255,6 +254,12 @@ impl Recover {
     }
 }
 
+/// Seconds of the command line.
+fn seconds(value: f64) -> Result<Duration> {
+    Duration::try_from_secs_f64(value)
+        .with_context(|| format!("{value}: expected seconds, 0 or more"))
+}
+
 fn exit_code(whole: bool) -> ExitCode {
     if whole {
         ExitCode::SUCCESS
@@ -298,7 +303,7 @@ fn qos(offered: &bags::Qos) -> String {
 }
 
 /// A size for a person.
-pub fn bytes(count: u64) -> String {
+fn bytes(count: u64) -> String {
     match count {
         0..10_000 => format!("{count} B"),
         10_000..10_000_000 => format!("{:.1} kB", count as f64 / 1e3),

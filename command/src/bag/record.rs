@@ -1,12 +1,11 @@
 //! `sctn bag record`.
 
-use super::recorder::{Progress, Recorder, RecorderOptions, Selection};
-use super::{CompressionName, DAMAGED, bytes};
-use crate::plain_node::plain_node;
+use super::{CompressionName, DAMAGED, bytes, seconds};
 use anyhow::{Context as _, Result, bail};
+use bag_transport::{Progress, Recorder, RecorderOptions, Selection};
 use bags::WriteOptions;
 use clap::Args;
-use node_kit::wait_for_end;
+use node_kit::{plain_node, wait_for_end};
 use regex::RegexSet;
 use std::io::{IsTerminal, Write};
 use std::path::PathBuf;
@@ -166,12 +165,6 @@ impl Record {
             ExitCode::from(DAMAGED)
         })
     }
-}
-
-/// Seconds of the command line.
-pub fn seconds(value: f64) -> Result<Duration> {
-    Duration::try_from_secs_f64(value)
-        .with_context(|| format!("{value}: expected seconds, 0 or more"))
 }
 
 async fn after(time: Option<Duration>) {

@@ -5,7 +5,6 @@ mod operator;
 mod recording;
 
 use crate::demos::demonstration;
-use crate::plain_node::plain_node;
 use crate::root::Root;
 use anyhow::{Context as _, Result, bail};
 use bags::{Demonstration, outcome_name};
@@ -15,7 +14,7 @@ use heightmap::Heightmap;
 use msgs::convert::heightmap_from_msg;
 use msgs::sctn_msgs::{Goal, PickPlace, Reward, StepConfirmation, StepResult};
 use multiravens::{Environment, EpisodeSeed};
-use node_kit::{Node, Qos, ns_from_stamp, wait_for_end};
+use node_kit::{Node, Qos, ns_from_stamp, plain_node, wait_for_end};
 use operator::{Operator, OperatorKind, Question, automatic};
 use recording::{LAST_HEIGHTMAP, LAST_WORDS, RunRecorder};
 use serde::Serialize;

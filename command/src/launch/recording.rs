@@ -1,15 +1,15 @@
 //! What `sctn launch` records of a run.
 
-use crate::bag::recorder::{KEPT, Recorder, RecorderOptions, Recording};
 use crate::launch::graph::Settings;
-use crate::plain_node::plain_node;
 use anyhow::Result;
+use bag_transport::{RECORDED_SUFFIX, Recorder, RecorderOptions, Recording};
 use bags::Qos;
 use msgs::Interface;
 use msgs::rosgraph_msgs::Clock;
 use msgs::sctn_msgs::{Goal, Heightmap, PickPlace, Reward, StepConfirmation, StepResult};
 use msgs::sensor_msgs::{CameraInfo, Image, JointState};
 use msgs::tf2_msgs::TFMessage;
+use node_kit::plain_node;
 use node_kit::{Context, Node};
 use std::path::Path;
 use std::time::Duration;
@@ -74,7 +74,7 @@ impl RunRecorder {
 
     /// Topic on which a step result is said once the bag holds it: a step goes on from what cannot be lost any more.
     pub fn kept_results() -> String {
-        format!("step_result/{KEPT}")
+        format!("step_result/{RECORDED_SUFFIX}")
     }
 
     /// Waits until somebody listens to [`Self::kept_results`].
@@ -108,6 +108,6 @@ impl RunRecorder {
     pub async fn finish(self) -> Result<Recording> {
         let recording = self.recorder.finish().await;
         self.context.shutdown();
-        recording
+        Ok(recording?)
     }
 }

@@ -16,6 +16,7 @@ mod once;
 mod parameter_services;
 mod parameter_store;
 mod parameters;
+mod plain;
 mod qos;
 mod raw;
 mod service;
@@ -35,6 +36,7 @@ pub use parameters::{
     InvalidParameter, Loaded, NoParameters, ParameterError, Parameters, Range, load_text,
     mistakes_in_documentation,
 };
+pub use plain::plain_node;
 pub use qos::Qos;
 pub use raw::{
     AsBytes, NoCdr, Offer, PublisherId, RawMessage, RawPublisher, RawQos, RawSubscription,

@@ -1,10 +1,10 @@
-//! Records topics of any type as a bag: `sctn bag record` and `sctn launch --record`.
+//! The recorder: one subscription for each topic, one thread that writes the bag.
 //!
-//! What a run decides, does and earns (confirmations, results, rewards) is handed to the system as soon as it arrives,
-//! with all that came before it, and is never left out for want of room in the queue. A step result that is safe in this way
-//! is said once more on its topic's [`KEPT`]: who hears it there finds it in the bag, whatever becomes of the recorder.
+//! Confirmations, step results and rewards are flushed to the file as soon as they arrive, together with everything before them,
+//! and are never dropped for lack of room in the queue. A flushed step result is republished on the topic with
+//! [`RECORDED_SUFFIX`] as an acknowledgement: whoever receives it there can rely on the bag, even if the recorder is killed.
 
-use anyhow::{Context as _, Result, anyhow};
+use crate::{LARGE_TYPES, TransportError};
 use bags::{BagError, BagWriter, Qos, Stamps, TopicHandle, WriteOptions};
 use msgs::Interface;
 use msgs::sctn_msgs::{Reward, StepConfirmation, StepResult};
@@ -27,20 +27,16 @@ const LOOK_EVERY: Duration = Duration::from_millis(100);
 const FLUSH_EVERY: Duration = Duration::from_secs(1);
 /// At the end, how long what has arrived may take to be read, should more go on arriving.
 const LAST_WORDS: Duration = Duration::from_secs(1);
-/// The moments after which a crash must lose nothing of a step.
+/// Types of which a crash must not lose a message: they are flushed at once.
 const FLUSHED_AT_ONCE: [&str; 3] = [
     StepConfirmation::TYPE_NAME,
     StepResult::TYPE_NAME,
     Reward::TYPE_NAME,
 ];
-/// Under the topic of step results: those that survive the end of the recorder. Hidden from other recorders.
-pub const KEPT: &str = "_recorded";
-/// Messages of these types are large: RustDDS keeps as many as the depth says, also those that were taken.
-pub const LARGE: [&str; 3] = [
-    "sensor_msgs/msg/Image",
-    "sensor_msgs/msg/PointCloud2",
-    "sensor_msgs/msg/CompressedImage",
-];
+/// Appended to the topic of step results: republished after the flush, as an acknowledgement. Hidden from other recorders.
+pub const RECORDED_SUFFIX: &str = "_recorded";
+
+type Result<T, E = TransportError> = std::result::Result<T, E>;
 
 /// How to record.
 #[derive(Clone, Copy, Debug)]
@@ -233,7 +229,7 @@ struct Written {
 impl Recorder {
     /// Begins a bag. The node hears every participant but its own.
     pub fn start(node: &Node, path: &Path, options: RecorderOptions) -> Result<Self> {
-        let bag = BagWriter::create(path, options.write).context("begin the bag")?;
+        let bag = BagWriter::create(path, options.write)?;
         let shared = Arc::new(Shared::default());
         let (queue, entries) = mpsc::channel();
         let writing = Writing {
@@ -251,6 +247,10 @@ impl Recorder {
                 let result = span.in_scope(|| writing.run(&entries));
                 ended.ended.store(true, Relaxed);
                 result
+            })
+            .map_err(|source| TransportError::Io {
+                what: "thread of the recorder".to_owned(),
+                source,
             })?;
         Ok(Self {
             node: node.clone(),
@@ -342,7 +342,11 @@ impl Recorder {
         let asked = RawQos {
             reliable: offered.iter().all(|qos| qos.reliable),
             transient_local: offered.iter().all(|qos| qos.transient_local),
-            depth: if LARGE.contains(&type_name) { 16 } else { 256 },
+            depth: if LARGE_TYPES.contains(&type_name) {
+                16
+            } else {
+                256
+            },
         };
         let index = match self.followed.get(topic) {
             Some(followed)
@@ -357,17 +361,18 @@ impl Recorder {
                 followed.index
             }
             None => {
-                let kept = if type_name == StepResult::TYPE_NAME && !topic.ends_with(KEPT) {
-                    let qos = RawQos {
-                        reliable: true,
-                        transient_local: false,
-                        depth: 64,
+                let kept =
+                    if type_name == StepResult::TYPE_NAME && !topic.ends_with(RECORDED_SUFFIX) {
+                        let qos = RawQos {
+                            reliable: true,
+                            transient_local: false,
+                            depth: 64,
+                        };
+                        let name = format!("{topic}/{RECORDED_SUFFIX}");
+                        Some(Box::new(self.node.raw_publisher(&name, type_name, qos)?))
+                    } else {
+                        None
                     };
-                    let name = format!("{topic}/{KEPT}");
-                    Some(Box::new(self.node.raw_publisher(&name, type_name, qos)?))
-                } else {
-                    None
-                };
                 let mut heard = self.shared.heard();
                 heard.push(Heard {
                     topic: topic.to_owned(),
@@ -490,21 +495,20 @@ impl Recorder {
         // The thread ends when all senders are gone: those of the tasks go with them.
         drop(queue);
         let written = tokio::task::spawn_blocking(move || writer.join())
-            .await?
-            .map_err(|_| anyhow!("the recorder's thread panicked"))?;
-        let Written { mut bag, end } = written.with_context(|| {
-            let partial = bags::partial_path(&path);
-            format!(
-                "record {}; what was written until then is in {}: sctn bag recover",
-                path.display(),
-                partial.display()
-            )
+            .await
+            .ok()
+            .and_then(std::result::Result::ok)
+            .ok_or(TransportError::Panicked("recorder"))?;
+        let Written { mut bag, end } = written.map_err(|source| TransportError::BrokenOff {
+            partial: bags::partial_path(&path),
+            bag: path.clone(),
+            source: Box::new(source),
         })?;
-        bag.flush().context("complete the bag")?;
+        bag.flush()?;
         let (messages, bytes, files) = (bag.message_count(), bag.bytes()?, bag.file_count());
         tokio::task::spawn_blocking(move || bag.finish())
-            .await?
-            .context("complete the bag")?;
+            .await
+            .map_err(|_| TransportError::Panicked("end of the recorder"))??;
         Ok(Recording {
             bag: path,
             end,
@@ -560,6 +564,10 @@ fn put_on_disk(bag: &BagWriter) -> Result<mpsc::SyncSender<File>> {
                     tracing::error!("{}: {error}", partial.display());
                 }
             }
+        })
+        .map_err(|source| TransportError::Io {
+            what: "thread of the disk".to_owned(),
+            source,
         })?;
     Ok(disk)
 }
@@ -613,9 +621,14 @@ impl Writing {
                     flush,
                 } => {
                     self.shared.queued_bytes.fetch_sub(data.len(), Relaxed);
-                    let topic = self.topics.get(index).and_then(Option::as_ref);
-                    let (handle, kept) =
-                        topic.context("a message of a topic that was not announced")?;
+                    // Each topic is announced in the queue before its first message.
+                    let Some((handle, kept)) = self.topics.get(index).and_then(Option::as_ref)
+                    else {
+                        tracing::error!(
+                            "a message of topic number {index}, which was not announced, is lost"
+                        );
+                        continue;
+                    };
                     self.bag.write_stamped(*handle, stamps, &data)?;
                     unflushed = true;
                     if flush {
@@ -658,7 +671,10 @@ impl Writing {
 
     fn is_disk_full(&self) -> Result<bool> {
         let partial = self.bag.partial();
-        let disk = rustix::fs::statvfs(partial).with_context(|| partial.display().to_string())?;
+        let disk = rustix::fs::statvfs(partial).map_err(|error| TransportError::Io {
+            what: partial.display().to_string(),
+            source: error.into(),
+        })?;
         Ok(disk.f_bavail.saturating_mul(disk.f_frsize) < self.min_free_bytes)
     }
 

@@ -1,8 +1,8 @@
 //! `sctn bag play`.
 
 use super::{DAMAGED, seconds};
-use anyhow::{Context as _, Result};
-use bag_transport::{Order, Played, Player, PlayerOptions};
+use anyhow::{Context as _, Result, anyhow};
+use bag_transport::{Order, Played, Player, PlayerOptions, TransportError};
 use clap::Args;
 use node_kit::{plain_node, wait_for_end};
 use regex::RegexSet;
@@ -96,7 +96,10 @@ impl Play {
             .flat_map(|rule| ["-r".to_owned(), rule.clone()])
             .collect();
         let (context, node) = plain_node("rosbag2_player", &remaps)?;
-        let player = Player::open(&node, &self.bag, options)?;
+        let player = Player::open(&node, &self.bag, options).map_err(|error| match error {
+            TransportError::Option { .. } => anyhow!("--{error}"),
+            other => other.into(),
+        })?;
         let keyboard = (!self.no_keyboard)
             .then(|| Keyboard::open(player.orders()))
             .flatten();

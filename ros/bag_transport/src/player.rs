@@ -203,8 +203,7 @@ impl Player {
     /// # Errors
     /// Options out of range, a bag that cannot be read, or no message on any chosen topic.
     pub fn open(node: &Node, bag: &Path, options: PlayerOptions) -> Result<Self> {
-        let range = |option, value: f64, ok: bool, expected: &str| {
-            let (value, expected) = (value.to_string(), expected.to_owned());
+        let range = |option, value: String, ok: bool, expected: String| {
             ok.then_some(()).ok_or(TransportError::Option {
                 option,
                 value,
@@ -212,10 +211,12 @@ impl Player {
             })
         };
         let rate_fits = options.rate.is_finite() && options.rate > 0.0;
-        range("rate", options.rate, rate_fits, "a number above 0")?;
+        let expected = "a number above 0".to_owned();
+        range("rate", options.rate.to_string(), rate_fits, expected)?;
         if let Some(hz) = options.clock_hz {
             let expected = format!("a rate above 0 and at most {MAX_CLOCK_HZ} Hz");
-            range("clock", hz, hz > 0.0 && hz <= MAX_CLOCK_HZ, &expected)?;
+            let fits = hz > 0.0 && hz <= MAX_CLOCK_HZ;
+            range("clock", format!("{hz} Hz"), fits, expected)?;
         }
         let bag = BagReader::open(bag)?;
         let topics = chosen(&bag, &options)?;
@@ -223,9 +224,13 @@ impl Player {
             return Err(nothing_to_play(&bag, "holds no message"));
         };
         let begin = first + options.start;
-        let (start_s, length_s) = (options.start.as_secs_f64(), (last - first).as_secs_f64());
-        let expected = format!("at most the {length_s:.3} s that the bag lasts");
-        range("start", start_s, begin <= last, &expected)?;
+        let start = format!("{} s", options.start.as_secs_f64());
+        let length_s = (last - first).as_secs_f64();
+        let expected = format!(
+            "at most the {length_s:.3} s that {} lasts",
+            bag.path().display()
+        );
+        range("start", start, begin <= last, expected)?;
         let end = match options.duration {
             Some(duration) => begin + duration,
             None => last + Duration::from_nanos(1),

@@ -7,73 +7,41 @@ use std::time::Duration;
 
 /// A bag that cannot be written or read.
 #[derive(Debug, thiserror::Error)]
+#[allow(missing_docs, reason = "each message names its fields")]
 pub enum BagError {
     /// The system refused.
     #[error("{}: {source}", path.display())]
-    Io {
-        /// File or folder.
-        path: PathBuf,
-        /// Why.
-        source: io::Error,
-    },
+    Io { path: PathBuf, source: io::Error },
     /// No space left.
     #[error("{}: the disk is full; the messages up to the last flush are kept", path.display())]
-    DiskFull {
-        /// The file.
-        path: PathBuf,
-    },
+    DiskFull { path: PathBuf },
     /// Bags are never overwritten.
     #[error("{}: exists already, expected a new name", path.display())]
-    Exists {
-        /// The folder.
-        path: PathBuf,
-    },
+    Exists { path: PathBuf },
     /// An earlier writer stopped half-way.
     #[error("{}: a half-written bag of an earlier run, expected none; recover or remove it", path.display())]
-    HalfWritten {
-        /// The folder.
-        path: PathBuf,
-    },
+    HalfWritten { path: PathBuf },
     /// Something else, or nothing.
     #[error("{}: not a bag: {reason}", path.display())]
-    NotABag {
-        /// File or folder.
-        path: PathBuf,
-        /// What is missing.
-        reason: String,
-    },
+    NotABag { path: PathBuf, reason: String },
     /// The file has no end: its writer stopped half-way, or it was cut.
     #[error("{}: ends early, expected a finished MCAP file; its writer stopped half-way or it was cut", path.display())]
-    Truncated {
-        /// The file.
-        path: PathBuf,
-    },
+    Truncated { path: PathBuf },
     /// The contents contradict themselves.
     #[error("{}: damaged: {reason}", path.display())]
-    Damaged {
-        /// The file.
-        path: PathBuf,
-        /// What was found.
-        reason: String,
-    },
+    Damaged { path: PathBuf, reason: String },
     /// A topic cannot have two types.
     #[error("topic {topic} is written as {actual} already, expected {expected}")]
     Conflict {
-        /// The topic.
         topic: String,
-        /// Its type so far.
         actual: String,
-        /// The type asked for.
         expected: String,
     },
     /// A message of another type than asked for.
     #[error("topic {topic} holds {actual}, expected {expected}")]
     Type {
-        /// The topic.
         topic: String,
-        /// Type found.
         actual: String,
-        /// Type expected.
         expected: String,
     },
     /// The type has changed since the bag was written.
@@ -81,33 +49,23 @@ pub enum BagError {
         "topic {topic} was written with another definition of {type_name}: hash {actual}, expected {expected}"
     )]
     Definition {
-        /// The topic.
         topic: String,
-        /// The type.
         type_name: String,
-        /// Hash in the bag.
         actual: String,
-        /// Hash of this program's definition.
         expected: String,
     },
-    /// A message that is none.
+    /// Not valid CDR.
     #[error("topic {topic} at {time:?}: {source}")]
     Message {
-        /// The topic.
         topic: String,
-        /// When it was logged.
         time: Duration,
-        /// What is wrong.
         source: msgs::CdrError,
     },
-    /// A message that rosbag2 compressed by itself, and that is none.
+    /// A message that rosbag2 compressed, and that is not valid Zstandard.
     #[error("topic {topic} at {time:?}: cannot be uncompressed: {reason}")]
     Packed {
-        /// The topic.
         topic: String,
-        /// When it was logged.
         time: Duration,
-        /// What is wrong.
         reason: String,
     },
     /// A time that the format cannot hold.

@@ -18,7 +18,7 @@ const COPY_BYTES: usize = 1 << 16;
 /// How the data of each message is compressed.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub(crate) enum Packing {
-    /// By what it begins with: nobody says it.
+    /// Recognised by its first bytes; the metadata does not name it.
     Undeclared,
     /// As `metadata.yaml` says.
     Zstd,

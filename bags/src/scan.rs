@@ -485,7 +485,7 @@ impl<'a> Iterator for Records<'a> {
         };
         let Some((opcode, body)) = record() else {
             self.position = self.bytes.len();
-            return Some(Err(format!("a record at byte {offset} that is none")));
+            return Some(Err(format!("invalid record at byte {offset}")));
         };
         self.position += RECORD_HEADER as usize + body.len();
         Some(Ok((offset as u64, opcode, body)))

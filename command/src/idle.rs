@@ -44,7 +44,7 @@ impl Node {
             else {
                 continue;
             };
-            // Whatever has ended meanwhile is none.
+            // A process that has ended meanwhile uses nothing.
             let Some(fields) = stat(pid) else { continue };
             if fields.get(1).and_then(|field| field.parse().ok()) == Some(parent) {
                 let path = std::fs::read_link(format!("/proc/{pid}/exe"))?;

@@ -99,27 +99,21 @@ pub enum Sampling {
 
 /// A sampling that cannot be used.
 #[derive(Debug, thiserror::Error, PartialEq)]
+#[allow(missing_docs, reason = "each message names its fields")]
 pub enum SamplingError {
     /// A weight is not a finite number of the allowed range.
     #[error(
         "sampling.modules.{module}.{field} is {value}, expected a finite number of at least {at_least}"
     )]
     Weight {
-        /// Name of the module.
         module: String,
-        /// Which weight.
         field: &'static str,
-        /// The value found.
         value: f64,
-        /// The smallest value allowed.
         at_least: f64,
     },
     /// A demonstration holds a module without weights.
     #[error("sampling has no weights for the module {module} of the demonstrations")]
-    UnknownModule {
-        /// Name of the module.
-        module: String,
-    },
+    UnknownModule { module: String },
     /// There is nothing to draw from.
     #[error("a demonstration without steps cannot be sampled")]
     Empty,

@@ -5,6 +5,7 @@ use serde::{Serialize, de::DeserializeOwned};
 
 /// Bytes that are not a message of the type expected, or a message that cannot be written.
 #[derive(Debug, thiserror::Error)]
+#[allow(missing_docs, reason = "each message names its fields")]
 pub enum CdrError {
     /// Shorter than the header.
     #[error("{0} bytes, expected at least the 4 of the CDR header")]
@@ -17,12 +18,7 @@ pub enum CdrError {
     Invalid(String),
     /// More bytes than the type has.
     #[error("{left_over} bytes left over after a message of {used}")]
-    LeftOver {
-        /// Bytes after the message.
-        left_over: usize,
-        /// Bytes of the message with its header.
-        used: usize,
-    },
+    LeftOver { left_over: usize, used: usize },
 }
 
 const HEADER_LITTLE_ENDIAN: [u8; 4] = [0, 1, 0, 0];

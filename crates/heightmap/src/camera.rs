@@ -74,17 +74,14 @@ pub struct Camera {
 
 /// A camera that cannot take pictures.
 #[derive(Debug, thiserror::Error, PartialEq)]
+#[allow(missing_docs, reason = "each message names its fields")]
 pub enum CameraError {
     /// An intrinsic parameter makes no sense.
     #[error("camera {camera}: {what} is {actual}, expected {expected}")]
     Intrinsics {
-        /// Name of the camera.
         camera: String,
-        /// Which parameter.
         what: &'static str,
-        /// Its value.
         actual: f64,
-        /// What was expected.
         expected: &'static str,
     },
     /// The distortion leaves a part of the image without rays.
@@ -93,21 +90,14 @@ pub enum CameraError {
          expected one that shows what is further out further out"
     )]
     Distortion {
-        /// Name of the camera.
         camera: String,
-        /// The coefficients.
         distortion: Distortion,
-        /// A pixel without a ray.
         u_px: f64,
-        /// A pixel without a ray.
         v_px: f64,
     },
     /// The pose has a part that is not finite.
     #[error("camera {camera}: the pose in the world is not finite")]
-    Pose {
-        /// Name of the camera.
-        camera: String,
-    },
+    Pose { camera: String },
 }
 
 impl Camera {

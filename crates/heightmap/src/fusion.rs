@@ -29,6 +29,7 @@ pub struct FusionReport {
 
 /// Why views cannot be fused.
 #[derive(Debug, thiserror::Error, PartialEq)]
+#[allow(missing_docs, reason = "each message names its fields")]
 pub enum FusionError {
     /// A camera cannot have taken the view.
     #[error(transparent)]
@@ -39,21 +40,14 @@ pub enum FusionError {
     /// An image has another size than its camera's.
     #[error("camera {camera}: {what} has {actual} elements, expected {expected}")]
     Size {
-        /// Name of the camera.
         camera: String,
-        /// Which image.
         what: &'static str,
-        /// Elements found.
         actual: usize,
-        /// Elements expected.
         expected: usize,
     },
     /// More views than can be summed.
     #[error("{actual} views, expected at most 128")]
-    Views {
-        /// Views given.
-        actual: usize,
-    },
+    Views { actual: usize },
 }
 
 /// Fuses views; owns the scratch memory so that a fusion allocates nothing.

@@ -89,49 +89,32 @@ pub enum Next {
 
 /// Why a primitive cannot start or go on. Nothing must move after one.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
+#[allow(missing_docs, reason = "each message names its fields")]
 pub enum PrimitiveError {
     /// A setting is out of range.
     #[error(transparent)]
     Settings(#[from] SettingsError),
     /// A pose has a coordinate that is not finite.
     #[error("the {which} pose is not finite")]
-    NotFinite {
-        /// Pick or place.
-        which: &'static str,
-    },
+    NotFinite { which: &'static str },
     /// A pose that the arm cannot work at.
     #[error("the {which} pose is out of reach: {reason}")]
     OutOfReach {
-        /// Pick or place.
         which: &'static str,
-        /// What cannot be reached.
         reason: Unreachable,
     },
     /// A motion cannot be planned.
     #[error("{phase:?}: {reason}")]
-    Plan {
-        /// Where the primitive stood.
-        phase: Phase,
-        /// Why.
-        reason: PlanError,
-    },
+    Plan { phase: Phase, reason: PlanError },
     /// Suction already holds something.
     #[error("the gripper already holds something, expected it to be empty")]
     AlreadyHolding,
     /// The arm lagged behind with nothing held: something is in its way.
     #[error("{phase:?}: the arm lags behind although it holds nothing, something is in its way")]
-    Blocked {
-        /// Where the primitive stood.
-        phase: Phase,
-    },
+    Blocked { phase: Phase },
     /// A report that does not answer the last command.
     #[error("{phase:?}: {report:?} does not answer the last command")]
-    UnexpectedReport {
-        /// Where the primitive stood.
-        phase: Phase,
-        /// What came.
-        report: Report,
-    },
+    UnexpectedReport { phase: Phase, report: Report },
 }
 
 /// A descent ends here when it meets nothing: a little below the table's top.

@@ -23,18 +23,14 @@ pub trait Robot {
 /// Why a primitive broke off. The arm is where it was; suction is as it was, because holding is
 /// safer than dropping.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
+#[allow(missing_docs, reason = "each message names its fields")]
 pub enum ExecuteError<E> {
     /// The primitive cannot start or go on.
     #[error(transparent)]
     Primitive(#[from] PrimitiveError),
     /// The robot did not do what it was told.
     #[error("{phase:?}: {error}")]
-    Robot {
-        /// Where the primitive stood.
-        phase: Phase,
-        /// What the robot said.
-        error: E,
-    },
+    Robot { phase: Phase, error: E },
 }
 
 /// Carries out one pick and place; `observe` is told each phase as it begins.

@@ -27,18 +27,14 @@ pub struct JointTrajectory {
 
 /// A motion that cannot be planned, or a trajectory that is not one.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
+#[allow(missing_docs, reason = "each message names its fields")]
 pub enum PlanError {
     /// A pose on the way is out of reach.
     #[error(transparent)]
     Unreachable(#[from] Unreachable),
     /// The way leads through a singular position: joints would have to jump.
     #[error("the straight way to {tip} is singular at joints {joints}")]
-    Singular {
-        /// Where the way was to end.
-        tip: Isometry3<f64>,
-        /// Where it broke off.
-        joints: Joints,
-    },
+    Singular { tip: Isometry3<f64>, joints: Joints },
     /// Empty, out of order, not finite, or beyond the joint limits.
     #[error("invalid trajectory: {0}")]
     Invalid(String),

@@ -2,39 +2,26 @@
 
 /// A message that cannot be converted.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
+#[allow(missing_docs, reason = "each message names its fields")]
 pub enum ConvertError {
     /// A sequence has another length than other fields ask for.
     #[error("{field} has {actual} elements, expected {expected}")]
     Size {
-        /// The field.
         field: &'static str,
-        /// Elements found.
         actual: usize,
-        /// Elements expected.
         expected: usize,
     },
     /// A number is infinite or not a number.
     #[error("{field} is not finite, expected a finite number")]
-    NotFinite {
-        /// The field.
-        field: &'static str,
-    },
+    NotFinite { field: &'static str },
     /// An element of a sequence is infinite or not a number.
     #[error("{field}[{index}] is not finite, expected a finite number")]
-    ElementNotFinite {
-        /// The field.
-        field: &'static str,
-        /// Index of the first such element.
-        index: usize,
-    },
+    ElementNotFinite { field: &'static str, index: usize },
     /// Any other value that is out of range or not known.
     #[error("{field} is {actual}, expected {expected}")]
     Unexpected {
-        /// The field.
         field: &'static str,
-        /// The value found.
         actual: String,
-        /// What would do.
         expected: String,
     },
     /// Points that make no trajectory.

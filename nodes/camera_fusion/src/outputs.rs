@@ -1,4 +1,4 @@
-//! Heightmaps as others want to see them; the costly ones only while somebody looks.
+//! The standard views of a heightmap (grid map, point cloud, image); each is made only while it has a subscriber.
 
 use heightmap::Heightmap;
 use msgs::{
@@ -10,7 +10,7 @@ use msgs::{
 };
 use node_kit::{Node, NodeError, Publisher, Qos};
 
-/// A topic that is filled while somebody listens. Who comes between two heightmaps gets the last one.
+/// A topic that is published while it has a subscriber. Late subscribers receive the latest heightmap.
 struct OnDemand<M: Interface> {
     publisher: Publisher<M>,
     wanted: bool,
@@ -78,7 +78,7 @@ impl Outputs {
         })
     }
 
-    /// Takes a new heightmap and shows it where somebody listened when last looked for.
+    /// Publishes a new heightmap on every view that had a subscriber at the last look.
     pub(crate) fn take(&mut self, heightmap: Heightmap, header: Header) {
         self.last = Some((heightmap, header));
         self.grid_map.shown = false;

@@ -1,4 +1,4 @@
-//! Node that poses as the UR driver and the cameras, backed by Rapier.
+//! Node that emulates the UR driver and the cameras, backed by Rapier.
 //!
 //! Simulated time advances only while a goal is active, so that a seed and the same goals give the
 //! same states, frames and stamps, however slow the host. The wall clock decides only how often

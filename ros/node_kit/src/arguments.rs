@@ -4,23 +4,16 @@ use std::path::PathBuf;
 
 /// Arguments that cannot be read.
 #[derive(Debug, thiserror::Error, PartialEq)]
+#[allow(missing_docs, reason = "each message names its fields")]
 pub enum ArgumentError {
     /// A flag stands last but needs a value.
     #[error("{flag} needs a value, as in `{example}`")]
-    MissingValue {
-        /// The flag.
-        flag: String,
-        /// How it is written.
-        example: &'static str,
-    },
+    MissingValue { flag: String, example: &'static str },
     /// `from:=to` was expected.
     #[error("{flag} {value}: expected `{example}`")]
     Malformed {
-        /// The flag.
         flag: String,
-        /// What was found.
         value: String,
-        /// How it is written.
         example: &'static str,
     },
     /// A flag inside `--ros-args` that we do not know.

@@ -178,6 +178,7 @@ impl Watched {
         let given = match node {
             "sim_workcell" => vec![("problems_dir", path("config/problems"))],
             "goal_oracle" => vec![("start_empty", "true".to_owned())],
+            "operator_console" => vec![("port", "0".to_owned())],
             "gctn_policy" => vec![(
                 "checkpoint",
                 root.shipped_checkpoint().display().to_string(),

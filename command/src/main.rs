@@ -3,6 +3,7 @@
 mod bag;
 mod bench;
 mod camera_stream;
+mod console;
 mod curves;
 mod demos;
 mod embed;
@@ -65,6 +66,8 @@ enum Command {
     Evaluate(evaluate::Evaluate),
     /// Launch the graph on a simulated cell, under an operator
     Launch(launch::Launch),
+    /// Serve the operator's page for a graph that runs, simulated or real
+    Console(console::ConsoleCommand),
     /// Draw what the cameras, the fusion, the demonstrator and the policy make of a problem
     Picture(picture::Picture),
 }
@@ -88,6 +91,7 @@ fn main() -> Result<ExitCode> {
         Command::Table(table) => table.run(&root()?),
         Command::Evaluate(evaluate) => evaluate.run(&root()?),
         Command::Launch(launch) => launch.run(&root()?),
+        Command::Console(console) => console.run(&root()?),
         Command::Picture(picture) => picture.run(&root()?),
     }?;
     Ok(ExitCode::SUCCESS)

@@ -20,12 +20,13 @@ def generate_launch_description() -> LaunchDescription:
     def share(*path: str) -> PathJoinSubstitution:
         return PathJoinSubstitution([FindPackageShare("sctn_nodes"), *path])
 
-    def node(executable: str, **parameters: object) -> Node:
+    def node(executable: str, condition: IfCondition | None = None, **parameters: object) -> Node:
         return Node(
             package="sctn_nodes",
             executable=executable,
             namespace=LaunchConfiguration("namespace"),
             parameters=[share("config", f"{executable}.yaml"), {"use_sim_time": False, **parameters}],
+            condition=condition,
             output="screen",
         )
 
@@ -49,11 +50,14 @@ def generate_launch_description() -> LaunchDescription:
             ),
             DeclareLaunchArgument("urdf", default_value=share("urdf", "workcell.urdf"), description="The work cell, calibrated."),
             DeclareLaunchArgument("publish_cell", default_value="false", description="Whether to publish the cell's description and tf."),
+            DeclareLaunchArgument("console", default_value="true", description="Whether to serve the operator's page."),
+            DeclareLaunchArgument("console_port", default_value="8750", description="Port of the operator's page; 0: the system chooses."),
             DeclareLaunchArgument("rviz", default_value="false", description="Whether to show the cell in RViz."),
             node("camera_fusion", calibration=LaunchConfiguration("calibration")),
             node("goal_oracle", demonstration=LaunchConfiguration("demonstration"), start_empty=True),
             node("gctn_policy", checkpoint=LaunchConfiguration("checkpoint")),
             node("suction_executor", urdf=LaunchConfiguration("urdf")),
+            node("operator_console", port=LaunchConfiguration("console_port"), condition=IfCondition(LaunchConfiguration("console"))),
             Node(
                 package="robot_state_publisher",
                 executable="robot_state_publisher",

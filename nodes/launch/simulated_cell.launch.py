@@ -2,7 +2,7 @@
 
 ros2 launch sctn_nodes simulated_cell.launch.py demonstration:=/path/to/bag problem:=placing seed:=10000 rviz:=true
 
-Who approves is another node: a person's, `sctn launch` has one, README.md shows one in rclpy.
+A person approves on the operator's page, whose address is printed; README.md shows a program that does, in rclpy.
 """
 
 from launch import LaunchDescription
@@ -17,12 +17,13 @@ def generate_launch_description() -> LaunchDescription:
     def share(*path: str) -> PathJoinSubstitution:
         return PathJoinSubstitution([FindPackageShare("sctn_nodes"), *path])
 
-    def node(executable: str, **parameters: object) -> Node:
+    def node(executable: str, condition: IfCondition | None = None, **parameters: object) -> Node:
         return Node(
             package="sctn_nodes",
             executable=executable,
             namespace=LaunchConfiguration("namespace"),
             parameters=[share("config", f"{executable}.yaml"), {"use_sim_time": True, **parameters}],
+            condition=condition,
             output="screen",
         )
 
@@ -42,6 +43,8 @@ def generate_launch_description() -> LaunchDescription:
                 description="Policy.",
             ),
             DeclareLaunchArgument("real_time_factor", default_value="1.0", description="Simulated seconds per second; 0.0: all that goes."),
+            DeclareLaunchArgument("console", default_value="true", description="Whether to serve the operator's page."),
+            DeclareLaunchArgument("console_port", default_value="8750", description="Port of the operator's page; 0: the system chooses."),
             DeclareLaunchArgument("rviz", default_value="false", description="Whether to show the cell in RViz."),
             node(
                 "sim_workcell",
@@ -55,6 +58,7 @@ def generate_launch_description() -> LaunchDescription:
             node("goal_oracle", demonstration=LaunchConfiguration("demonstration"), start_empty=True),
             node("gctn_policy", checkpoint=LaunchConfiguration("checkpoint")),
             node("suction_executor", urdf=share("urdf", "workcell.urdf")),
+            node("operator_console", port=LaunchConfiguration("console_port"), condition=IfCondition(LaunchConfiguration("console"))),
             Node(
                 package="rviz2",
                 executable="rviz2",

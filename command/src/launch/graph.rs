@@ -21,10 +21,21 @@ pub struct Settings {
     pub embedding: PathBuf,
     /// Whether nothing moves, and with the oracle nothing advances, without an operator's word.
     pub operated: bool,
+    /// The operator's console, where there is one.
+    pub console: Option<Console>,
+}
+
+/// What the operator's console is told.
+pub struct Console {
+    /// File that it writes the address of its page to.
+    pub address_file: PathBuf,
+    /// Folder of the demonstrations that can be repeated.
+    pub library: PathBuf,
 }
 
 /// In the order in which they go to work: the first goal comes when all others are there.
-pub const NODES: [&str; 5] = [
+pub const NODES: [&str; 6] = [
+    "operator_console",
     "sim_workcell",
     "camera_fusion",
     "gctn_policy",
@@ -36,6 +47,20 @@ pub const NODES: [&str; 5] = [
 const BRING_UP: Duration = Duration::from_secs(30);
 
 impl Settings {
+    /// Those of [`NODES`] that are launched.
+    fn nodes(&self) -> impl Iterator<Item = &'static str> {
+        let console = self.console.is_some();
+        NODES
+            .into_iter()
+            .filter(move |node| console || *node != "operator_console")
+    }
+
+    /// Nodes that hear what an operator says.
+    pub fn listeners(&self) -> usize {
+        // Policy, executor and oracle.
+        3 + usize::from(self.console.is_some())
+    }
+
     fn parameters(&self, root: &Root, node: &str) -> Vec<(&'static str, String)> {
         let path = |path: &Path| path.display().to_string();
         match node {
@@ -52,6 +77,15 @@ impl Settings {
                 ("require_confirmation", self.operated.to_string()),
             ],
             "gctn_policy" => vec![("checkpoint", path(&self.checkpoint))],
+            "operator_console" => match &self.console {
+                Some(console) => vec![
+                    // Several graphs on one machine do not take each other's port.
+                    ("port", "0".to_owned()),
+                    ("address_file", path(&console.address_file)),
+                    ("library", path(&console.library)),
+                ],
+                None => Vec::new(),
+            },
             "suction_executor" => vec![
                 ("urdf", path(&root.join("urdf/workcell.urdf"))),
                 ("require_approval", self.operated.to_string()),
@@ -90,6 +124,7 @@ pub fn start(
         "camera_fusion" => context.start(node, arguments, camera_fusion::configure),
         "goal_oracle" => context.start(node, arguments, goal_oracle::configure),
         "gctn_policy" => context.start(node, arguments, gctn_policy::configure),
+        "operator_console" => context.start(node, arguments, operator_console::configure),
         _ => context.start(node, arguments, suction_executor::configure),
     }
 }
@@ -104,10 +139,17 @@ pub enum Graph {
 }
 
 impl Graph {
+    fn names(&self) -> Vec<&'static str> {
+        match self {
+            Self::Composed(tasks) => tasks.iter().map(|(name, _)| *name).collect(),
+            Self::Processes { children, .. } => children.iter().map(|(name, _)| *name).collect(),
+        }
+    }
+
     /// All nodes in this process.
     pub fn compose(root: &Root, settings: &Settings, context: &Context) -> Result<Self> {
         let mut tasks = Vec::new();
-        for node in NODES {
+        for node in settings.nodes() {
             let (arguments, _) = RosArguments::parse(settings.arguments(root, node))?;
             tasks.push((node, start(context, node, &arguments)?));
         }
@@ -120,7 +162,7 @@ impl Graph {
         let folder = program.parent().context("folder of the program")?;
         std::fs::create_dir_all(logs).with_context(|| logs.display().to_string())?;
         let mut children = Vec::new();
-        for node in NODES {
+        for node in settings.nodes() {
             let executable = folder.join(node);
             if !executable.is_file() {
                 bail!(
@@ -150,8 +192,9 @@ impl Graph {
     /// Configures all nodes, then activates one after the other, and waits until `listeners` hear what the operator
     /// says. `node` asks them to.
     pub async fn bring_up(&mut self, node: &Node, listeners: usize) -> Result<()> {
+        let names = self.names();
         let bringing_up = async {
-            let led = NODES.map(|name| async move {
+            let led = names.into_iter().map(|name| async move {
                 let client = LifecycleClient::new(node, &node.resolve(name))?;
                 client.wait(BRING_UP).await?;
                 let (from, to) = (State::Unconfigured, State::Inactive);

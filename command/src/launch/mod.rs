@@ -30,6 +30,8 @@ const MAX_REFUSALS: u32 = 5;
 const ORACLE: &str = "oracle";
 /// A run whose last goal is reached may still owe the result and reward of its last step.
 const LAST_RESULT: Duration = Duration::from_secs(5);
+/// Pages learn of the end of the run before their console ends.
+const LAST_LOOK: Duration = Duration::from_secs(2);
 
 /// Arguments of `sctn launch`.
 #[derive(Args)]
@@ -56,6 +58,9 @@ pub struct Launch {
     /// Checkpoint for the goal module of that name [default: the shipped one]
     #[arg(long)]
     embedding: Option<PathBuf>,
+    /// Folder of the tasks that --operator web can have repeated; what is taught is saved there
+    #[arg(long, default_value = "out/library")]
+    library: PathBuf,
     /// Folder for the bag, the demonstration, logs and a picture of the last heightmap
     #[arg(long)]
     record: Option<PathBuf>,
@@ -140,6 +145,13 @@ impl Launch {
                 .clone()
                 .unwrap_or_else(|| root.shipped_embedding()),
             operated: self.operator != OperatorKind::Watch,
+            console: match self.operator {
+                OperatorKind::Web => Some(graph::Console {
+                    address_file: std::path::absolute(temporary.path().join("console"))?,
+                    library: std::path::absolute(&self.library)?,
+                }),
+                _ => None,
+            },
         };
         gctn::set_threads(1);
         let runtime = tokio::runtime::Builder::new_multi_thread()
@@ -198,9 +210,15 @@ impl Launch {
             Graph::compose(root, settings, &context)?
         };
         let run = async {
-            // Policy, executor and oracle hear the operator, and so does the recorder.
-            let listeners = 3 + usize::from(recorder.is_some());
+            // The nodes hear the operator, and so does the recorder.
+            let listeners = settings.listeners() + usize::from(recorder.is_some());
             graph.bring_up(&node, listeners).await?;
+            if let Some(console) = &settings.console {
+                let file = &console.address_file;
+                let page =
+                    std::fs::read_to_string(file).with_context(|| file.display().to_string())?;
+                println!("operator console: {}", page.trim());
+            }
             if let Some(recorder) = &recorder {
                 recorder.wait_for_desk().await;
             }
@@ -322,10 +340,13 @@ impl Desk {
     /// Until the run is over: the goal is complete, or the steps are used up.
     async fn work(&mut self, kind: OperatorKind, max_steps: usize) -> Result<()> {
         let alone = matches!(kind, OperatorKind::Auto | OperatorKind::Watch);
-        while !self.complete && (self.steps < max_steps || !alone) {
+        let web = kind == OperatorKind::Web;
+        // A person has the last word on the last step too.
+        let done = |desk: &Self| desk.complete && (!web || !desk.confirms || desk.goals_reached);
+        while !done(self) && (self.steps < max_steps || !alone) {
             let question = tokio::select! {
                 proposal = self.proposals.recv() => self.operator.proposal(proposal),
-                result = self.results.recv() => self.result(result)?,
+                result = self.results.recv() => self.result(kind, result)?,
                 reward = self.rewards.recv() => {
                     self.total_reward = reward.total;
                     self.measured_ns = ns_from_stamp(&reward.header.stamp);
@@ -350,10 +371,18 @@ impl Desk {
             }
         }
         self.wait_for_last_heightmap().await;
+        if web {
+            // Open pages show the end of the run.
+            tokio::time::sleep(LAST_LOOK).await;
+        }
         Ok(())
     }
 
-    fn result(&mut self, result: StepResult) -> Result<Option<Question>> {
+    fn result(&mut self, kind: OperatorKind, result: StepResult) -> Result<Option<Question>> {
+        if kind == OperatorKind::Web {
+            // The person sees faults and refusals, and decides how to go on.
+            return Ok(self.operator.result(result));
+        }
         if result.outcome == StepResult::FAULT {
             bail!("the robot failed: {}", result.reason);
         }
@@ -392,7 +421,7 @@ impl Desk {
             }
         };
         let decision = match kind {
-            OperatorKind::None | OperatorKind::Watch => return Ok(()),
+            OperatorKind::None | OperatorKind::Watch | OperatorKind::Web => return Ok(()),
             _ if !self.confirms && matches!(question, Question::Confirm(..)) => return Ok(()),
             OperatorKind::Auto => automatic(&question),
             OperatorKind::Terminal => {

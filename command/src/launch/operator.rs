@@ -11,6 +11,8 @@ pub enum OperatorKind {
     Auto,
     /// Asks the person at the terminal
     Terminal,
+    /// Serves a page on which a person decides, and prints its address
+    Web,
     /// A person who only watches: every proposal is carried out, and the goal module, or with the oracle the motion's
     /// outcome, says which goal is next. Ctrl-C ends the run
     Watch,

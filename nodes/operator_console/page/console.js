@@ -1,0 +1,511 @@
+// The operator's page: what the console says, as pictures and words, and the operator's decisions.
+
+import { Api } from "./api.js";
+import { board, draw, drawProposal, pointed } from "./view.js";
+
+const ROBOT_MODES = {
+  "-1": "no controller", 0: "disconnected", 1: "confirm safety", 2: "booting", 3: "power off", 4: "power on", 5: "idle",
+  6: "backdrive", 7: "running", 8: "updating firmware",
+};
+const SAFETY_MODES = {
+  1: "normal", 2: "reduced", 3: "protective stop", 4: "recovery", 5: "safeguard stop", 6: "system emergency stop",
+  7: "robot emergency stop", 8: "violation", 9: "fault", 10: "validate joint id", 11: "undefined", 12: "automatic mode safeguard stop",
+  13: "three-position enabling stop",
+};
+const LEGENDS = {
+  color: "Yellow ring: pick. Green cross: place; its hand shows the turn.",
+  height: "Dark blue: the table. Yellow: the highest.",
+  difference: "Orange: something is to come here. Blue: something is to go. Pink: the colour differs.",
+};
+const DECISIONS = ["approve", "reject", "advance", "retry", "stop"];
+
+const $ = (id) => document.getElementById(id);
+const boards = { now: board($("board-now"), "The table now, from above"), goal: board($("board-goal"), "The goal of this step, from above") };
+
+let state = null;
+let link = "lost";
+/** Pictures by which they are: present, goal, goal-2, before-1. */
+const pictures = new Map();
+const loading = new Set();
+/** What the operator was told about the last click. */
+let answer = "";
+let busy = false;
+/** The operator's own pick and place while it is being made. */
+let correction = null;
+/** Phase of the lesson that the page shows. */
+let lessonShown = "";
+
+const api = new Api((next) => { state = next; render(); }, (word) => {
+  if (word === "up" && link !== "up") loadLibrary();
+  link = word;
+  renderLink();
+});
+
+function make(tag, properties, ...children) {
+  const made = Object.assign(document.createElement(tag), properties);
+  made.append(...children);
+  return made;
+}
+
+/** Changes the page only where its text is another one: what has the focus or is being read stays. */
+function setText(node, text) {
+  if (node.textContent !== text) node.textContent = text;
+}
+
+function isOperator() {
+  return state !== null && state.operator === api.viewer;
+}
+
+/** Loads a picture unless it is there. */
+function need(which, number) {
+  const picture = pictures.get(which);
+  if (picture?.number === number) return picture;
+  if (!loading.has(which)) {
+    loading.add(which);
+    api.heightmap(which)
+      .then((loaded) => pictures.set(which, loaded))
+      .catch(() => {})
+      .finally(() => { loading.delete(which); render(); });
+  }
+  return null;
+}
+
+/** Why a decision cannot be made here and now; nothing where it can. */
+function obstacle(action) {
+  if (link !== "up") return "The link to the console is lost: what you see is old.";
+  if (correction && ["approve", "reject"].includes(action)) return "You are correcting: propose it, or keep the policy's.";
+  if (!state) return "Nothing has come from the cell yet.";
+  if (action === "stop") return state.lesson ? undefined : state.refused.stop?.reason;
+  if (busy) return "The last click is on its way.";
+  if (!isOperator()) {
+    const operator = state.viewers.find((viewer) => viewer.operator);
+    return operator ? `${operator.name} decides. You are watching.` : "You are watching. Take control to decide.";
+  }
+  if (state.lesson && action !== "home") return "A lesson is being given. Save it or end it first.";
+  if (action === "teach") return state.phase === "moving" ? "The arm is moving." : undefined;
+  if (action === "correct") return ["proposed", "awaiting_proposal"].includes(state.phase) ? undefined : "Nothing can be proposed now.";
+  if (action === "home") return state.phase === "moving" || state.lesson?.phase === "moving" ? "The arm is moving." : undefined;
+  if (action === "continue") return state.phase === "stopped" ? undefined : "The run is not stopped.";
+  const refused = state.refused[action];
+  if (refused) return `${refused.reason} ${refused.advice}`;
+  if (action === "approve" && pictures.get("present")?.number !== state.heightmap?.number) return "The newest picture is on its way.";
+  return undefined;
+}
+
+async function act(action) {
+  const why = obstacle(action);
+  if (why) {
+    answer = why;
+    return renderButtons();
+  }
+  if (action === "correct") return correction ? endCorrection() : beginCorrection();
+  busy = true;
+  answer = "";
+  renderButtons();
+  try {
+    if (action === "home") await api.post("home");
+    else if (action === "teach") await api.post("lesson/begin");
+    else if (action === "continue") await api.post("step", { step: state.goal.step });
+    else await api.post("decisions", { proposal_id: state.proposal?.id ?? "0", decision: action });
+  } catch (error) {
+    answer = error.message;
+  }
+  busy = false;
+  renderButtons();
+}
+
+const RADIANS = Math.PI / 180;
+const form = $("correction");
+
+function beginCorrection() {
+  const { heightmap: map, proposal } = state;
+  const middle = { x_m: map.origin_x_m + (map.cols * map.pixel_size_m) / 2, y_m: map.origin_y_m + (map.rows * map.pixel_size_m) / 2, yaw_rad: 0 };
+  correction = structuredClone({ pick: proposal?.pick ?? middle, place: proposal?.place ?? middle });
+  answer = "";
+  showCorrection();
+  form.elements.pick_x.focus();
+}
+
+function endCorrection() {
+  correction = null;
+  showCorrection();
+  $("correct").focus();
+}
+
+/** Numbers and drawing follow the correction. */
+function showCorrection() {
+  form.hidden = !correction;
+  $("correct").setAttribute("aria-expanded", String(Boolean(correction)));
+  document.body.classList.toggle("correcting", Boolean(correction));
+  if (correction) {
+    const { pick, place } = correction;
+    const turn = pick && place ? turnOf(correction) : 0;
+    const numbers = { pick_x: pick?.x_m * 1000, pick_y: pick?.y_m * 1000, place_x: place?.x_m * 1000, place_y: place?.y_m * 1000, turn };
+    for (const [name, value] of Object.entries(numbers)) {
+      if (document.activeElement !== form.elements[name]) form.elements[name].value = Number.isFinite(value) ? Math.round(value) : "";
+    }
+  }
+  render();
+}
+
+form.addEventListener("input", () => {
+  const number = (name) => form.elements[name].valueAsNumber;
+  const next = { pick_x: number("pick_x"), pick_y: number("pick_y"), place_x: number("place_x"), place_y: number("place_y"), turn: number("turn") };
+  if (!Object.values(next).every(Number.isFinite)) return;
+  const pick = (correction.pick ??= { yaw_rad: 0 });
+  const place = (correction.place ??= {});
+  Object.assign(pick, { x_m: next.pick_x / 1000, y_m: next.pick_y / 1000 });
+  Object.assign(place, { x_m: next.place_x / 1000, y_m: next.place_y / 1000, yaw_rad: pick.yaw_rad + next.turn * RADIANS });
+  render();
+});
+form.addEventListener("submit", async (event) => {
+  event.preventDefault();
+  await ask(async () => {
+    if (state.lesson) return api.post("lesson/show", { ...correction, preset: form.elements.preset.value });
+    await api.post("proposals", correction);
+    endCorrection();
+    $("approve").focus();
+  });
+});
+$("cancel-correction").addEventListener("click", endCorrection);
+
+/** Asks for something, and shows why it was not done. */
+async function ask(what) {
+  answer = "";
+  try {
+    await what();
+  } catch (error) {
+    answer = error.message;
+  }
+  renderButtons();
+}
+
+// A lesson: pick and place are chosen as in a correction, and carried out at once.
+$("reached").addEventListener("click", () => ask(() => api.post("lesson/judge", { reached: true })));
+$("missed").addEventListener("click", () => ask(() => api.post("lesson/judge", { reached: false })));
+$("undo").addEventListener("click", () => ask(() => api.post("lesson/undo")));
+$("end-lesson").addEventListener("click", () => {
+  if (state.lesson?.unsaved && !confirm("The lesson has steps that are not saved. End it all the same?")) return;
+  ask(() => api.post("lesson/end"));
+});
+$("save-lesson").addEventListener("submit", (event) => {
+  event.preventDefault();
+  const { name } = event.target.elements;
+  ask(async () => {
+    await api.post("lesson/save", { name: name.value });
+    answer = `Saved as ${name.value}.`;
+    await loadLibrary();
+  });
+});
+
+const LESSON_WORDS = {
+  choosing: "Click what to pick, then where to place it.",
+  moving: "The arm moves. Watch it; stop if anything is wrong.",
+  looking: "The cameras look at the result.",
+  judging: "Is this as it should be?",
+};
+
+function renderLesson() {
+  const { lesson } = state;
+  $("lesson").hidden = !lesson;
+  document.body.classList.toggle("teaching", Boolean(lesson));
+  form.elements.preset.parentElement.hidden = !lesson;
+  $("cancel-correction").hidden = Boolean(lesson);
+  setText($("send-correction"), lesson ? "Carry it out" : "Propose this");
+  setText($("correction-help"), lesson ? "Click what to pick, then where to place it; or type [mm, degrees]." : "Drag pick and place on the picture, or type [mm, degrees].");
+  if (!lesson) {
+    if (lessonShown) {
+      lessonShown = "";
+      correction = null;
+      showCorrection();
+    }
+    return;
+  }
+  const choosing = lesson.phase === "choosing";
+  const judging = lesson.phase === "judging";
+  const outcome = judging ? ` The arm ${lesson.outcome}.` : "";
+  const undo = lesson.undoes ? " It takes the last step back." : "";
+  setText($("lesson-state"), `Lesson, ${lesson.step_count} ${lesson.step_count === 1 ? "step" : "steps"} so far. ${LESSON_WORDS[lesson.phase]}${outcome}${undo}`);
+  const able = { reached: judging, missed: judging, undo: choosing && lesson.step_count > 0 };
+  for (const [id, may] of Object.entries(able)) $(id).hidden = !may;
+  $("save-lesson").hidden = !choosing || lesson.step_count === 0;
+  $("end-lesson").hidden = lesson.phase === "moving";
+  if (lessonShown !== lesson.phase) {
+    lessonShown = lesson.phase;
+    // The next step is chosen anew: nothing is picked where nothing was clicked.
+    correction = choosing && state.heightmap && isOperator() ? { pick: null, place: null } : null;
+    showCorrection();
+  }
+}
+
+async function loadLibrary() {
+  const list = await api.get("demonstrations").catch(() => null);
+  if (!list) return;
+  setText($("library-note"), list.length ? "" : "No task has been saved yet.");
+  const items = list.map((entry) => {
+    const saved = new Date(1000 * entry.saved_at_s).toLocaleString();
+    const repeat = make("button", { type: "button", textContent: `Repeat ${entry.name}` });
+    repeat.addEventListener("click", () => {
+      if (isOperator()) ask(() => api.post("demonstrations/repeat", { name: entry.name }));
+      else setText($("library-note"), "You are watching. Take control to have a task repeated.");
+    });
+    const pictures = make("div", { className: "pair" });
+    for (const [step, label] of [[0, "start"], [entry.step_count, "end"]]) {
+      const container = make("div", { className: "board" });
+      const { canvas } = board(container, `${entry.name}, ${label}`);
+      api.heightmap(`demonstrations/${entry.name}/${step}`).then((picture) => draw(canvas, picture, "color")).catch(() => {});
+      pictures.append(container);
+    }
+    const words = `${entry.name}: ${entry.step_count} ${entry.step_count === 1 ? "step" : "steps"}, ${saved}`;
+    return make("li", {}, make("p", { textContent: words }), pictures, repeat);
+  });
+  $("library").replaceChildren(...items);
+}
+
+/** Drags what is nearest to the pointer: pick or place. */
+boards.now.svg.addEventListener("pointerdown", (event) => {
+  if (!correction) return;
+  const { svg } = boards.now;
+  const [x_m, y_m] = pointed(state.heightmap, svg, event);
+  const distance = (pose) => Math.hypot(pose.x_m - x_m, pose.y_m - y_m);
+  // In a lesson the first click is the pick, the second the place.
+  for (const which of ["pick", "place"]) {
+    if (correction[which]) continue;
+    correction[which] = { x_m, y_m, yaw_rad: 0 };
+    if (which === "pick") return showCorrection();
+    break;
+  }
+  const dragged = distance(correction.pick) < distance(correction.place) ? correction.pick : correction.place;
+  const drag = (moved) => {
+    [dragged.x_m, dragged.y_m] = pointed(state.heightmap, svg, moved);
+    showCorrection();
+  };
+  drag(event);
+  svg.setPointerCapture(event.pointerId);
+  svg.addEventListener("pointermove", drag);
+  svg.addEventListener("pointerup", () => svg.removeEventListener("pointermove", drag), { once: true });
+});
+
+function changeOperator(change) {
+  return ask(() => api.post("operator", change));
+}
+
+function renderLink() {
+  const words = {
+    up: "Connected", lost: "Link lost: connecting again…", join: "Not joined",
+    token: "No valid token: open the address that the console printed when it was started",
+  };
+  setText($("link"), words[link]);
+  document.body.classList.toggle("lost", link !== "up");
+  if (link === "join" && !$("join").open) $("join").showModal();
+  renderButtons();
+}
+
+function renderRole() {
+  const operator = state.viewers.find((viewer) => viewer.operator);
+  setText($("role"), isOperator() ? "You decide" : operator ? `You watch. ${operator.name} decides` : "You watch. Nobody decides");
+  const control = $("control");
+  const wanted = isOperator() ? "release" : operator ? `take ${operator.id}` : "take";
+  if (control.dataset.shown === wanted) return;
+  control.dataset.shown = wanted;
+  const focused = control.contains(document.activeElement);
+  let button;
+  if (isOperator()) {
+    button = make("button", { type: "button", textContent: "Give up control", onclick: () => changeOperator({ action: "hand_over", to: null }) });
+  } else {
+    const text = operator ? `Take control from ${operator.name}` : "Take control";
+    button = make("button", { type: "button", textContent: text, onclick: () => changeOperator({ action: "take", from: operator?.id ?? null }) });
+  }
+  control.replaceChildren(button);
+  if (focused) button.focus();
+}
+
+function renderButtons() {
+  for (const action of [...DECISIONS, "correct", "home", "continue", "teach"]) {
+    $(action).setAttribute("aria-disabled", String(Boolean(obstacle(action))));
+  }
+  const stopped = state?.phase === "stopped";
+  const judging = state?.phase === "awaiting_confirmation" || state?.phase === "fault";
+  // What cannot be meant now is not offered.
+  const lesson = Boolean(state?.lesson);
+  const running = !judging && !stopped && !lesson;
+  const shown = { approve: running, reject: running, correct: running, advance: judging && !lesson, retry: judging && !lesson, continue: stopped && !lesson };
+  for (const [action, show] of Object.entries(shown)) {
+    const button = $(action);
+    if (!show && document.activeElement === button) $("headline").focus();
+    button.hidden = !show;
+  }
+  const main = judging ? "advance" : stopped ? "continue" : "approve";
+  setText($("why"), answer || (lesson && isOperator() ? "" : obstacle(main)) || "");
+  const refused = state?.refused.approve;
+  const stale = link !== "up" || (state?.phase === "proposed" && Boolean(refused));
+  document.body.classList.toggle("stale", stale);
+}
+
+/** How far the object turns, from -180 to 180 degrees. */
+function turnOf({ pick, place }) {
+  const turn = (place.yaw_rad - pick.yaw_rad) / RADIANS;
+  return ((((turn + 180) % 360) + 360) % 360) - 180;
+}
+
+function renderPictures() {
+  const mode = document.querySelector("input[name=mode]:checked").value;
+  setText($("legend"), LEGENDS[mode]);
+  const map = state.heightmap;
+  const present = map && (need("present", map.number) ?? pictures.get("present"));
+  const goalMap = state.goal?.heightmap;
+  const goal = goalMap && (need("goal", goalMap.number) ?? pictures.get("goal"));
+  const drawn = `${mode} ${present?.number} ${goal?.number}`;
+  if ($("boards").dataset.drawn !== drawn) {
+    $("boards").dataset.drawn = drawn;
+    const share = present ? draw(boards.now.canvas, present, mode, goal) : 0;
+    if (goal) draw(boards.goal.canvas, goal, mode === "difference" ? "color" : mode);
+    setText($("now-note"), mode === "difference" && present && goal ? `(${(100 * share).toFixed(1)} % of it differs from the goal)` : "");
+  }
+  setText($("goal-note"), state.goal ? `(step ${state.goal.step} of ${state.goal.step_count}, ${state.goal.module})` : "");
+  if (correction && !state.lesson && !["proposed", "awaiting_proposal"].includes(state.phase)) return endCorrection();
+  const proposal = correction ?? (state.lesson ? null : ["proposed", "moving"].includes(state.phase) ? state.proposal : null);
+  const overlay = JSON.stringify([proposal, present?.number]);
+  if (map && boards.now.svg.dataset.drawn !== overlay) {
+    boards.now.svg.dataset.drawn = overlay;
+    drawProposal(boards.now.svg, map, present, proposal);
+  }
+  const metres = (pose) => `x ${pose.x_m.toFixed(3)} m, y ${pose.y_m.toFixed(3)} m`;
+  setText($("proposal"), correction
+    ? correction.pick && correction.place
+      ? `Your pick at ${metres(proposal.pick)}. Your place at ${metres(proposal.place)}, turned by ${Math.round(turnOf(proposal))}°.`
+      : correction.pick ? "Now click where to place it." : "Click what to pick."
+    : proposal
+    ? `Pick at ${metres(proposal.pick)}. Place at ${metres(proposal.place)}, turned by ${Math.round(turnOf(proposal))}°. The policy gives the pick ${Math.round(100 * proposal.pick_score)} % and the place ${Math.round(100 * proposal.place_score)} %.`
+    : "");
+}
+
+/** A small picture in a list. */
+function thumbnail(which, number, label) {
+  const container = make("div", { className: "board" });
+  const picture = number == null ? null : need(which, number);
+  if (picture) draw(board(container, label).canvas, picture, "color");
+  else container.append(make("span", { className: "unknown", textContent: "not seen yet" }));
+  return container;
+}
+
+/** Makes a list anew where it shows something else than before. */
+function renderList(list, items, key, item) {
+  const shown = JSON.stringify(items.map(key));
+  if (list.dataset.shown === shown) return;
+  list.dataset.shown = shown;
+  list.replaceChildren(...items.map(item));
+}
+
+function renderStrip() {
+  const goal = state.goal;
+  const steps = goal ? Array.from({ length: goal.step_count }, (_, index) => index + 1) : [];
+  const number = (step) => goal.strip[step];
+  const ready = (step) => number(step) != null && pictures.get(`goal-${step}`)?.number === number(step);
+  const now = (step) => step === goal.step && !goal.complete;
+  renderList($("strip"), steps, (step) => [number(step), ready(step), now(step)], (step) => {
+    const item = make("li", {}, thumbnail(`goal-${step}`, number(step), `Goal of step ${step}`), `Step ${step}${now(step) ? " (now)" : ""}`);
+    if (now(step)) item.setAttribute("aria-current", "step");
+    return item;
+  });
+}
+
+function renderSteps() {
+  const ready = (which) => pictures.get(which)?.number;
+  const steps = state.steps.toReversed();
+  renderList($("steps"), steps, (step) => [step.number, step.decision, step.after, ready(`before-${step.number}`), ready(`after-${step.number}`)], (step) => {
+    const decided = { advance: "succeeded", retry: "failed" }[step.decision];
+    const who = decided ? `: ${step.decided_by} said it ${decided}` : "";
+    const text = `Step ${step.proposal.step}, attempt ${step.proposal.attempt + 1}: ${step.outcome}, ${step.duration_s.toFixed(1)} s${who}`;
+    return make("li", {}, make("p", { textContent: text }), make("div", { className: "pair" },
+      thumbnail(`before-${step.number}`, step.before, `Before step ${step.proposal.step}`),
+      thumbnail(`after-${step.number}`, step.after, `After step ${step.proposal.step}`)));
+  });
+}
+
+function renderPeople() {
+  renderList($("people"), state.viewers, (viewer) => [viewer, isOperator()], (viewer) => {
+    const me = viewer.id === api.viewer;
+    const role = viewer.operator ? "decides" : "watches";
+    const text = `${viewer.name}${me ? " (you)" : ""} ${role}${viewer.present ? "" : ", page not in sight"}`;
+    const item = make("li", {}, make("span", { textContent: text }));
+    if (isOperator() && !me) {
+      item.append(make("button", { type: "button", textContent: `Hand over to ${viewer.name}`, onclick: () => changeOperator({ action: "hand_over", to: viewer.id }) }));
+    }
+    return item;
+  });
+}
+
+function renderRobot() {
+  const { robot } = state;
+  const on = (value) => (value == null ? "unknown" : value ? "on" : "off");
+  const rows = [
+    ["Robot mode", ROBOT_MODES[robot.robot_mode] ?? "unknown"],
+    ["Safety", SAFETY_MODES[robot.safety_mode] ?? "unknown"],
+    ["Program", robot.program_running == null ? "unknown" : robot.program_running ? "running" : "not running"],
+    ["Suction", on(robot.suction)],
+    ["Gripper", robot.vacuum == null ? "unknown" : robot.vacuum ? "holds something" : "empty"],
+  ];
+  for (const [node, said] of Object.entries(state.nodes)) {
+    if (said.level > 0) rows.push([node.slice(1), said.message]);
+  }
+  renderList($("robot"), rows.flat(), (text) => text, (text, index) => make(index % 2 ? "dd" : "dt", { textContent: text }));
+  renderList($("streams"), state.streams, (stream) => [stream.name, stream.age_s?.toFixed(1), stream.stale], (stream) => {
+    const age = stream.age_s == null ? "never came" : `${stream.age_s.toFixed(1)} s`;
+    const row = make("tr", { className: stream.stale ? "stale" : "" }, make("th", { scope: "row", textContent: stream.name }), make("td", { textContent: stream.stale ? `${age}, stale` : age }));
+    return row;
+  });
+}
+
+function renderMessages() {
+  renderList($("messages"), state.notices.toReversed(), (notice) => notice.number, (notice) => {
+    const kind = { refusal: "Refused. ", fault: "Fault. ", note: "" }[notice.kind];
+    return make("li", { className: notice.kind }, `${kind}${notice.reason} ${notice.advice}`);
+  });
+}
+
+function render() {
+  if (!state) return;
+  setText($("headline"), state.lesson ? "Teaching a new task" : state.headline);
+  setText($("advice"), state.lesson ? "Show one pick and place after the other. The robot repeats them later, from where the objects lie then." : state.advice);
+  renderRole();
+  renderLesson();
+  renderPictures();
+  renderButtons();
+  renderStrip();
+  renderMessages();
+  renderPeople();
+  renderRobot();
+  renderSteps();
+}
+
+for (const action of [...DECISIONS, "correct", "home", "continue", "teach"]) $(action).addEventListener("click", () => act(action));
+for (const radio of document.querySelectorAll("input[name=mode]")) radio.addEventListener("change", render);
+
+const KEYS = new Map([...document.querySelectorAll("[aria-keyshortcuts]")].map((button) => [button.getAttribute("aria-keyshortcuts"), button.id]));
+document.addEventListener("keydown", (event) => {
+  const typing = event.target.matches?.("input:not([type=radio], [type=checkbox]), textarea, dialog *");
+  if (typing || event.repeat || event.ctrlKey || event.altKey || event.metaKey || !$("keys").checked) return;
+  const action = KEYS.get(event.key.toLowerCase());
+  if (action && !$(action).hidden) {
+    event.preventDefault();
+    act(action);
+  }
+});
+
+$("name").value = sessionStorage.getItem("name") ?? "";
+$("join").addEventListener("cancel", (event) => event.preventDefault());
+$("join-form").addEventListener("submit", async (event) => {
+  event.preventDefault();
+  try {
+    await api.join($("name").value);
+    $("join").close();
+    $("join-error").textContent = "";
+    $("headline").focus();
+  } catch (error) {
+    $("join-error").textContent = error.message;
+  }
+});
+$("headline").tabIndex = -1;
+
+api.start();

@@ -1,0 +1,162 @@
+// Heightmaps as pictures. The robot stands below the picture and looks up: x up, y to the left.
+
+const SVG = "http://www.w3.org/2000/svg";
+/** Heights differ when they do by more [m]. */
+const HEIGHT_DIFFERS_M = 0.005;
+/** Colours differ when one of red, green and blue does by more. */
+const COLOR_DIFFERS = 40;
+/** Where the object under the cursor ends: a step in height [m], and its largest reach [m]. */
+const EDGE_M = 0.008;
+const REACH_M = 0.2;
+const RAMP = [[24, 22, 66], [50, 90, 142], [38, 150, 140], [122, 201, 90], [253, 231, 76]];
+
+/** World position to picture, in cells. */
+export function toPicture(map, x_m, y_m) {
+  return [map.rows - (y_m - map.origin_y_m) / map.pixel_size_m, map.cols - (x_m - map.origin_x_m) / map.pixel_size_m];
+}
+
+/** World position of a pointer event on a board. */
+export function pointed(map, svg, event) {
+  const box = svg.getBoundingClientRect();
+  const [u, v] = [((event.clientX - box.left) / box.width) * map.rows, ((event.clientY - box.top) / box.height) * map.cols];
+  return toWorld(map, Math.min(Math.max(u, 0.5), map.rows - 0.5), Math.min(Math.max(v, 0.5), map.cols - 0.5));
+}
+
+/** Picture, in cells, to world position. */
+export function toWorld(map, u, v) {
+  return [map.origin_x_m + (map.cols - v) * map.pixel_size_m, map.origin_y_m + (map.rows - u) * map.pixel_size_m];
+}
+
+function ramp(share) {
+  const at = Math.min(Math.max(share, 0), 0.9999) * (RAMP.length - 1);
+  const [low, high] = [RAMP[Math.floor(at)], RAMP[Math.floor(at) + 1]];
+  return low.map((value, index) => value + (high[index] - value) * (at % 1));
+}
+
+/** Draws a heightmap; `other` is what it is compared with. Returns the share of cells that differ, in mode difference. */
+export function draw(canvas, picture, mode, other) {
+  const { rows, cols, rgb, height_m } = picture;
+  canvas.width = rows;
+  canvas.height = cols;
+  const context = canvas.getContext("2d");
+  const image = context.createImageData(rows, cols);
+  let highest = 0.02;
+  if (mode === "height") for (const height of height_m) highest = Math.max(highest, height);
+  const comparable = mode === "difference" && other?.rows === rows && other.cols === cols;
+  let different = 0;
+  for (let row = 0; row < rows; row++) {
+    for (let col = 0; col < cols; col++) {
+      const cell = row * cols + col;
+      const pixel = 4 * ((cols - 1 - col) * rows + rows - 1 - row);
+      let color = [rgb[3 * cell], rgb[3 * cell + 1], rgb[3 * cell + 2]];
+      if (mode === "height") {
+        color = ramp(height_m[cell] / highest);
+      } else if (comparable) {
+        const rise = other.height_m[cell] - height_m[cell];
+        let change = 0;
+        for (let part = 0; part < 3; part++) change = Math.max(change, Math.abs(other.rgb[3 * cell + part] - color[part]));
+        const grey = 0.25 * (color[0] + color[1] + color[2]) / 3;
+        if (rise > HEIGHT_DIFFERS_M) color = [255, 160, 40];
+        else if (rise < -HEIGHT_DIFFERS_M) color = [90, 160, 255];
+        else if (change > COLOR_DIFFERS) color = [224, 110, 224];
+        else color = [grey, grey, grey];
+        if (color[0] !== color[1] || color[1] !== color[2]) different++;
+      }
+      image.data.set([...color, 255], pixel);
+    }
+  }
+  context.putImageData(image, 0, 0);
+  return different / (rows * cols);
+}
+
+/** Cells of the object under a world position: [row, first col, last col], relative to the position, in cells. */
+export function objectAt(map, picture, x_m, y_m) {
+  const { rows, cols, height_m } = picture;
+  const [startRow, startCol] = [Math.floor((y_m - map.origin_y_m) / map.pixel_size_m), Math.floor((x_m - map.origin_x_m) / map.pixel_size_m)];
+  const start = startRow * cols + startCol;
+  if (!(startRow >= 0 && startRow < rows && startCol >= 0 && startCol < cols) || height_m[start] < EDGE_M / 2) return [];
+  const reach = REACH_M / map.pixel_size_m;
+  const seen = new Set([start]);
+  const open = [start];
+  while (open.length) {
+    const cell = open.pop();
+    const [row, col] = [Math.floor(cell / cols), cell % cols];
+    for (const [nextRow, nextCol] of [[row - 1, col], [row + 1, col], [row, col - 1], [row, col + 1]]) {
+      const next = nextRow * cols + nextCol;
+      if (nextRow < 0 || nextRow >= rows || nextCol < 0 || nextCol >= cols || seen.has(next)) continue;
+      if (Math.hypot(nextRow - startRow, nextCol - startCol) > reach) continue;
+      if (height_m[next] < EDGE_M / 2 || Math.abs(height_m[next] - height_m[cell]) > EDGE_M) continue;
+      seen.add(next);
+      open.push(next);
+    }
+  }
+  // Neighbours in a row are one rectangle.
+  const cells = [...seen].sort((a, b) => a - b);
+  const runs = [];
+  for (const cell of cells) {
+    const [row, col] = [Math.floor(cell / cols), cell % cols];
+    const last = runs.at(-1);
+    if (last && last[0] === row && last[2] === col - 1) last[2] = col;
+    else runs.push([row, col, col]);
+  }
+  const [rowAt, colAt] = [(y_m - map.origin_y_m) / map.pixel_size_m, (x_m - map.origin_x_m) / map.pixel_size_m];
+  return runs.map(([row, first, last]) => [row - rowAt, first - colAt, last + 1 - colAt]);
+}
+
+function element(name, attributes, parent, text) {
+  const made = document.createElementNS(SVG, name);
+  for (const [key, value] of Object.entries(attributes)) made.setAttribute(key, value);
+  if (text) made.textContent = text;
+  parent?.append(made);
+  return made;
+}
+
+function mark(svg, tag, kind, attributes) {
+  element(tag, { ...attributes, class: "halo", "stroke-width": 4.5 }, svg);
+  element(tag, { ...attributes, class: kind, "stroke-width": 2 }, svg);
+}
+
+/** Draws pick, place, turn, and the object at its new pose. */
+export function drawProposal(svg, map, picture, proposal) {
+  svg.setAttribute("viewBox", `0 0 ${map.rows} ${map.cols}`);
+  svg.replaceChildren();
+  if (!proposal?.pick) return;
+  const { pick, place } = proposal;
+  const [pickU, pickV] = toPicture(map, pick.x_m, pick.y_m);
+  const label = (text, u, v) => element("text", { x: Math.min(u + 8, map.rows - 30), y: Math.max(v - 7, 9), class: "mark" }, svg, text);
+  if (!place) {
+    mark(svg, "circle", "pick", { cx: pickU, cy: pickV, r: 6 });
+    return label("Pick", pickU, pickV);
+  }
+  const [placeU, placeV] = toPicture(map, place.x_m, place.y_m);
+  const turn = place.yaw_rad - pick.yaw_rad;
+  if (picture) {
+    const [cos, sin] = [Math.cos(turn), Math.sin(turn)];
+    const corner = (row, col) => {
+      // A turn about the world's z axis, from x (columns) to y (rows).
+      const [x, y] = [cos * col - sin * row, sin * col + cos * row];
+      return `${(placeU - y).toFixed(2)} ${(placeV - x).toFixed(2)}`;
+    };
+    const path = objectAt(map, picture, pick.x_m, pick.y_m).map(
+      ([row, first, last]) => `M${corner(row, first)}L${corner(row, last)}L${corner(row + 1, last)}L${corner(row + 1, first)}Z`,
+    );
+    element("path", { d: path.join(""), class: "object" }, svg);
+  }
+  mark(svg, "line", "way", { x1: pickU, y1: pickV, x2: placeU, y2: placeV, "stroke-dasharray": "5 3" });
+  mark(svg, "circle", "pick", { cx: pickU, cy: pickV, r: 6 });
+  mark(svg, "path", "place", { d: `M${placeU - 6} ${placeV}h12M${placeU} ${placeV - 6}v12` });
+  // The turn: a hand that points where the object's x axis points.
+  mark(svg, "line", "place", { x1: placeU, y1: placeV, x2: placeU - 14 * Math.sin(turn), y2: placeV - 14 * Math.cos(turn) });
+  label("Pick", pickU, pickV);
+  label("Place", placeU, placeV);
+}
+
+/** A canvas with a drawing over it. */
+export function board(container, label) {
+  const canvas = document.createElement("canvas");
+  canvas.setAttribute("role", "img");
+  canvas.setAttribute("aria-label", label);
+  const svg = element("svg", { "aria-hidden": "true", preserveAspectRatio: "none" });
+  container.replaceChildren(canvas, svg);
+  return { canvas, svg };
+}

@@ -1,0 +1,300 @@
+//! A lesson: picks and places that a person shows become a demonstration. No clock, no node.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use bags::{Demonstration, DemonstrationStep};
+use msgs::convert;
+use msgs::sctn_msgs::{Heightmap, PickPlace, StepResult};
+use serde::Serialize;
+
+use crate::refusal::Refusal;
+use crate::run::{Pose, View};
+
+/// Most steps of a lesson: each holds a heightmap.
+const MOST_STEPS: usize = 100;
+/// Longest name of a demonstration [characters].
+const LONGEST_NAME: usize = 40;
+
+/// How far a lesson is.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum LessonPhase {
+    /// The person chooses pick and place.
+    Choosing,
+    /// The arm moves.
+    Moving,
+    /// The arm has moved, and its result is not in view yet.
+    Looking,
+    /// The person says whether the step is as it should be.
+    Judging,
+}
+
+/// A motion that the person has asked for.
+#[derive(Clone, Debug)]
+struct Trial {
+    proposal: PickPlace,
+    before: Arc<Heightmap>,
+    /// It takes the last step back.
+    undoes: bool,
+    /// Outcome, and the end of the motion.
+    ended: Option<(u8, Duration)>,
+    after: Option<Arc<Heightmap>>,
+}
+
+/// A step that is kept.
+#[derive(Clone, Debug)]
+struct Shown {
+    proposal: PickPlace,
+    outcome: u8,
+    before: Arc<Heightmap>,
+    after: Arc<Heightmap>,
+}
+
+/// Steps so far, and the one that is being shown.
+#[derive(Clone, Debug, Default)]
+pub struct Lesson {
+    steps: Vec<Shown>,
+    trial: Option<Trial>,
+    trials: u32,
+    /// Steps have been shown since the lesson was saved.
+    unsaved: bool,
+}
+
+/// A lesson, as JSON for the page.
+#[derive(Debug, Serialize)]
+pub struct LessonState {
+    phase: LessonPhase,
+    /// Number of steps that are kept.
+    step_count: usize,
+    /// How the last motion ended, in words; nothing before the first.
+    outcome: Option<&'static str>,
+    /// The motion that is judged takes the last step back.
+    undoes: bool,
+    unsaved: bool,
+}
+
+impl Lesson {
+    /// How far it is.
+    pub fn phase(&self) -> LessonPhase {
+        match &self.trial {
+            None => LessonPhase::Choosing,
+            Some(Trial { ended: None, .. }) => LessonPhase::Moving,
+            Some(Trial { after: None, .. }) => LessonPhase::Looking,
+            Some(_) => LessonPhase::Judging,
+        }
+    }
+
+    /// For the page.
+    pub fn state(&self) -> LessonState {
+        let ended = self.trial.as_ref().and_then(|trial| trial.ended);
+        LessonState {
+            phase: self.phase(),
+            step_count: self.steps.len(),
+            outcome: ended.map(|(outcome, _)| crate::run::outcome_words(outcome)),
+            undoes: self.trial.as_ref().is_some_and(|trial| trial.undoes),
+            unsaved: self.unsaved,
+        }
+    }
+
+    fn check(&self, expected: LessonPhase) -> Result<(), Refusal> {
+        if self.phase() == expected {
+            return Ok(());
+        }
+        let (reason, advice) = match self.phase() {
+            LessonPhase::Choosing => ("Nothing has been shown.", "Choose pick and place first."),
+            LessonPhase::Moving => ("The arm is moving.", "Wait until it is back, or stop it."),
+            LessonPhase::Looking => (
+                "The cameras have not shown the result yet.",
+                "Wait a moment.",
+            ),
+            LessonPhase::Judging => (
+                "The last motion has not been judged.",
+                "Say first whether the step is as it should be.",
+            ),
+        };
+        Err(Refusal::new(reason, advice))
+    }
+
+    /// A motion begins: `proposal` was made from `before`.
+    ///
+    /// # Errors
+    /// When another one is not finished, or the lesson is full.
+    pub fn begin(
+        &mut self,
+        proposal: PickPlace,
+        before: &View,
+        undoes: bool,
+    ) -> Result<(), Refusal> {
+        self.check(LessonPhase::Choosing)?;
+        if self.steps.len() >= MOST_STEPS {
+            return Err(Refusal::new(
+                format!("The lesson has {MOST_STEPS} steps, which is the most."),
+                "Save it.",
+            ));
+        }
+        self.trials += 1;
+        self.trial = Some(Trial {
+            proposal,
+            before: Arc::clone(&before.heightmap),
+            undoes,
+            ended: None,
+            after: None,
+        });
+        Ok(())
+    }
+
+    /// Step number and attempt of the next motion.
+    pub fn next(&self) -> (u32, u32) {
+        (self.steps.len() as u32 + 1, self.trials)
+    }
+
+    /// The executor has reported at `ended`. A refused motion is forgotten.
+    pub fn on_result(&mut self, result: &StepResult, ended: Duration) {
+        let Some(trial) = &mut self.trial else {
+            return;
+        };
+        if trial.proposal.id != result.proposal_id {
+            return;
+        }
+        match result.outcome {
+            StepResult::REFUSED | StepResult::REJECTED => self.trial = None,
+            outcome => trial.ended = Some((outcome, ended)),
+        }
+    }
+
+    /// A heightmap has come: the first one after the motion shows its result.
+    pub fn on_heightmap(&mut self, view: &View) {
+        if let Some(trial) = &mut self.trial
+            && let Some((_, ended)) = trial.ended
+            && trial.after.is_none()
+            && view.stamp >= ended
+        {
+            trial.after = Some(Arc::clone(&view.heightmap));
+        }
+    }
+
+    /// The person says whether the step is as it should be: it is kept, or forgotten.
+    ///
+    /// # Errors
+    /// When there is nothing to judge.
+    pub fn judge(&mut self, reached: bool) -> Result<(), Refusal> {
+        self.check(LessonPhase::Judging)?;
+        let ended = self.trial.as_ref().and_then(|trial| trial.ended);
+        if reached && ended.is_none_or(|(outcome, _)| convert::outcome_from_msg(outcome).is_err()) {
+            return Err(Refusal::new(
+                "The motion was broken off: it cannot be a step.",
+                "Bring the arm home, then try again.",
+            ));
+        }
+        let Some(Trial {
+            proposal,
+            before,
+            undoes,
+            ended: Some((outcome, _)),
+            after: Some(after),
+        }) = self.trial.take()
+        else {
+            return Ok(());
+        };
+        match (reached, undoes) {
+            (true, false) => {
+                self.steps.push(Shown {
+                    proposal,
+                    outcome,
+                    before,
+                    after,
+                });
+                self.unsaved = true;
+            }
+            (true, true) => {
+                self.steps.pop();
+                self.unsaved = true;
+            }
+            (false, _) => {}
+        }
+        Ok(())
+    }
+
+    /// Pick and place that take the last step back: the object goes from where it was placed to where it was picked.
+    ///
+    /// # Errors
+    /// When there is no step, or the last motion is not judged.
+    pub fn undo(&self) -> Result<(Pose, Pose, PickPlace), Refusal> {
+        self.check(LessonPhase::Choosing)?;
+        let Some(last) = self.steps.last() else {
+            return Err(Refusal::new(
+                "There is no step to take back.",
+                "Choose pick and place.",
+            ));
+        };
+        let pose = |pose: &msgs::geometry_msgs::Pose2D| Pose {
+            x_m: pose.x,
+            y_m: pose.y,
+            yaw_rad: pose.theta,
+        };
+        let shown = last.proposal.clone();
+        Ok((pose(&shown.place), pose(&shown.pick), shown))
+    }
+
+    /// The steps as a demonstration. Each of them is worth the same.
+    ///
+    /// # Errors
+    /// When the name cannot be that of a folder, there is no step, or the last motion is not judged.
+    pub fn demonstration(&self, name: &str) -> Result<Demonstration, Refusal> {
+        check_name(name)?;
+        self.check(LessonPhase::Choosing)?;
+        let invalid = |error: convert::ConvertError| {
+            Refusal::new(
+                format!("A step cannot be saved: {error}."),
+                "Begin the lesson anew.",
+            )
+        };
+        let Some(last) = self.steps.last() else {
+            return Err(Refusal::new(
+                "The lesson has no step.",
+                "Show at least one step, and say that it is as it should be.",
+            ));
+        };
+        let heightmap = |message: &Arc<Heightmap>| {
+            convert::heightmap_from_msg(Heightmap::clone(message)).map_err(invalid)
+        };
+        let steps = self.steps.iter().map(|shown| {
+            Ok(DemonstrationStep {
+                observation: heightmap(&shown.before)?,
+                action: convert::pick_place_from_msg(&shown.proposal).map_err(invalid)?,
+                settings: convert::settings_from_msg(&shown.proposal.settings).map_err(invalid)?,
+                module: shown.proposal.module.clone(),
+                delta_reward: 1.0 / self.steps.len() as f64,
+                outcome: convert::outcome_from_msg(shown.outcome).map_err(invalid)?,
+            })
+        });
+        Ok(Demonstration {
+            problem: name.to_owned(),
+            seed: 0,
+            start_seed: 0,
+            steps: steps.collect::<Result<_, Refusal>>()?,
+            last: heightmap(&last.after)?,
+        })
+    }
+
+    /// What was shown has been saved.
+    pub fn saved(&mut self) {
+        self.unsaved = false;
+    }
+}
+
+/// A name of a demonstration is that of its folder.
+///
+/// # Errors
+/// When it is none.
+pub fn check_name(name: &str) -> Result<(), Refusal> {
+    let good = |character: char| character.is_ascii_alphanumeric() || "-_".contains(character);
+    if (1..=LONGEST_NAME).contains(&name.len()) && name.chars().all(good) {
+        return Ok(());
+    }
+    Err(Refusal::new(
+        format!("A demonstration's name has 1 to {LONGEST_NAME} letters, digits, - and _."),
+        "Type another name.",
+    ))
+}

@@ -1,0 +1,361 @@
+//! Node that serves the operator's page: see, approve and stop a run in a browser.
+//!
+//! [`Run`](run::Run) is what the operator sees, [`Sessions`](session::Sessions) who watches and who decides; neither knows ROS
+//! node, clock or network.
+
+mod console;
+mod lesson;
+mod library;
+mod parameters;
+mod refusal;
+mod run;
+mod server;
+mod session;
+mod tls;
+
+use std::fs::OpenOptions;
+use std::io::Write as _;
+use std::os::unix::fs::OpenOptionsExt as _;
+use std::path::Path;
+use std::sync::Arc;
+use std::time::{Duration, Instant};
+
+use anyhow::Context as _;
+use msgs::diagnostic_msgs::DiagnosticArray;
+use msgs::sctn_msgs::{
+    Goal, Heightmap, LoadDemonstration, LoadDemonstrationRequest, PickPlace, Reward, SetStep,
+    SetStepRequest, StepConfirmation, StepResult,
+};
+use msgs::sensor_msgs::JointState;
+use msgs::std_msgs::Bool;
+use msgs::std_srvs::{Trigger, TriggerRequest};
+use msgs::ur_dashboard_msgs::{RobotMode, SafetyMode};
+use msgs::ur_msgs::{Digital, IOStates};
+use node_kit::{Active, CallOptions, Level, Node, Publisher, Qos, ServiceClient};
+use tokio_rustls::TlsAcceptor;
+use tokio_util::sync::CancellationToken;
+use tracing::{info, warn};
+
+use crate::console::{Command, Console};
+use crate::library::Library;
+use crate::run::{Run, Watch};
+use crate::server::Access;
+use crate::session::Sessions;
+use crate::tls::Listener;
+
+pub use parameters::{OperatorConsoleParameters, Tls};
+
+/// Joint states are taken over at most this often: a UR5 sends 500 a second.
+const JOINTS_PERIOD: Duration = Duration::from_millis(50);
+const CHOOSE_ANOTHER: &str =
+    "Choose another demonstration, or look whether the goal oracle is at work.";
+/// How long the way home may take.
+const HOME_TIMEOUT: CallOptions = CallOptions {
+    attempts: 1,
+    timeout: Duration::from_secs(60),
+};
+
+/// A secret of 256 random bits, for tokens and sessions.
+pub(crate) fn secret() -> String {
+    let bytes: [u8; 32] = rand::random();
+    bytes.iter().map(|byte| format!("{byte:02x}")).collect()
+}
+
+/// Reads certificate and key; what it returns serves the page while it is active.
+pub async fn configure(
+    node: Node,
+    parameters: OperatorConsoleParameters,
+) -> anyhow::Result<ConsoleNode> {
+    let tls = match parameters.has_tls() {
+        true => Some(tls::acceptor(
+            &parameters.tls.certificate,
+            &parameters.tls.key,
+        )?),
+        false => None,
+    };
+    let watch = Watch {
+        nodes: parameters
+            .nodes
+            .iter()
+            .filter(|name| !name.is_empty())
+            .map(|name| node.resolve(name))
+            .collect(),
+        executor: node.resolve(&parameters.executor),
+        stale_after: Duration::from_secs_f64(parameters.stale_after_s),
+    };
+    let session_timeout = Duration::from_secs_f64(parameters.session_timeout_s);
+    let sessions = Sessions::new(parameters.max_viewers, session_timeout);
+    Ok(ConsoleNode {
+        confirmations: node.publisher("step_confirmation", Qos::Event)?,
+        proposals: node.publisher("pick_place", Qos::Latched)?,
+        home: Arc::new(node.service_client(&format!("{}/home", parameters.executor))?),
+        set_step: Arc::new(node.service_client(&format!("{}/set_step", parameters.goal_oracle))?),
+        load: Arc::new(
+            node.service_client(&format!("{}/load_demonstration", parameters.goal_oracle))?,
+        ),
+        library: Arc::new(Library::new(parameters.library.clone())),
+        token: match parameters.token.as_str() {
+            "" => secret(),
+            token => token.to_owned(),
+        },
+        console: Arc::new(Console::new(Run::new(watch), sessions)),
+        tls,
+        parameters,
+    })
+}
+
+/// The configured node.
+pub struct ConsoleNode {
+    parameters: OperatorConsoleParameters,
+    token: String,
+    tls: Option<TlsAcceptor>,
+    console: Arc<Console>,
+    confirmations: Publisher<StepConfirmation>,
+    proposals: Publisher<PickPlace>,
+    home: Arc<ServiceClient<Trigger>>,
+    set_step: Arc<ServiceClient<SetStep>>,
+    load: Arc<ServiceClient<LoadDemonstration>>,
+    library: Arc<Library>,
+}
+
+impl Active for ConsoleNode {
+    async fn run(&mut self, node: &Node) -> anyhow::Result<()> {
+        let mut commands = self.console.connect();
+        let end = CancellationToken::new();
+        let _ended = end.clone().drop_guard();
+        self.serve(node, &end).await?;
+        let io_and_status = |name| format!("{}/{name}", self.parameters.io_and_status);
+        let mut heightmaps = node.subscription::<Heightmap>("heightmap", Qos::Latched)?;
+        let mut goals = node.subscription::<Goal>("goal", Qos::Latched)?;
+        let mut proposals = node.subscription::<PickPlace>("pick_place", Qos::Latched)?;
+        let mut confirmations =
+            node.subscription::<StepConfirmation>("step_confirmation", Qos::Event)?;
+        let mut results = node.subscription::<StepResult>("step_result", Qos::Event)?;
+        let mut rewards = node.subscription::<Reward>("reward", Qos::Event)?;
+        let mut diagnostics = node.subscription::<DiagnosticArray>("/diagnostics", Qos::Event)?;
+        let mut joints = node.subscription::<JointState>("joint_states", Qos::Event)?;
+        let mut pins = node.subscription::<IOStates>(&io_and_status("io_states"), Qos::Event)?;
+        let mut robot_modes =
+            node.subscription::<RobotMode>(&io_and_status("robot_mode"), Qos::Latched)?;
+        let mut safety_modes =
+            node.subscription::<SafetyMode>(&io_and_status("safety_mode"), Qos::Latched)?;
+        let mut running =
+            node.subscription::<Bool>(&io_and_status("robot_program_running"), Qos::Latched)?;
+        let console = Arc::clone(&self.console);
+        let mut joints_taken: Option<Instant> = None;
+        loop {
+            tokio::select! {
+                Some(command) = commands.recv() => self.carry_out(node, command),
+                message = heightmaps.recv() => {
+                    if let Err(reason) = console.change(|state, now| state.on_heightmap(message, now)) {
+                        heightmaps.reject(reason);
+                    }
+                }
+                message = goals.recv() => {
+                    if let Err(reason) = console.change(|state, now| state.run.on_goal(message, now)) {
+                        goals.reject(reason);
+                    }
+                }
+                message = proposals.recv() => {
+                    if let Err(reason) = console.change(|state, _| state.run.on_proposal(message)) {
+                        proposals.reject(reason);
+                    }
+                }
+                message = confirmations.recv() => console.change(|state, _| state.on_confirmation(&message)),
+                message = results.recv() => {
+                    if let Err(reason) = console.change(|state, now| state.on_result(&message, now)) {
+                        results.reject(reason);
+                    }
+                }
+                message = rewards.recv() => console.change(|state, _| state.run.on_reward(message)),
+                message = diagnostics.recv() => {
+                    console.change_quietly(|state, now| state.run.on_diagnostics(message, now));
+                }
+                message = joints.recv() => {
+                    if joints_taken.is_none_or(|taken| taken.elapsed() >= JOINTS_PERIOD) {
+                        joints_taken = Some(Instant::now());
+                        let JointState { name, position, .. } = message;
+                        if name.len() != position.len() || name.len() > 64 {
+                            joints.reject(format_args!(
+                                "{} names and {} positions, expected as many of each, at most 64", name.len(), position.len()
+                            ));
+                            continue;
+                        }
+                        console.change_quietly(|state, now| state.run.on_joints(name, position, now));
+                    }
+                }
+                message = pins.recv() => {
+                    let suction = level(&message.digital_out_states, self.parameters.suction_pin);
+                    let vacuum = level(&message.digital_in_states, self.parameters.vacuum_pin);
+                    console.change_quietly(|state, _| state.run.on_robot(|robot| {
+                        robot.suction = suction;
+                        robot.vacuum = vacuum;
+                    }));
+                }
+                message = robot_modes.recv() => {
+                    console.change(|state, _| state.run.on_robot(|robot| robot.robot_mode = Some(message.mode)));
+                }
+                message = safety_modes.recv() => {
+                    console.change(|state, _| state.run.on_robot(|robot| robot.safety_mode = Some(message.mode)));
+                }
+                message = running.recv() => {
+                    console.change(|state, _| state.run.on_robot(|robot| robot.program_running = Some(message.data)));
+                }
+            }
+        }
+    }
+}
+
+impl ConsoleNode {
+    /// Serves the page until `end`.
+    async fn serve(&self, node: &Node, end: &CancellationToken) -> anyhow::Result<()> {
+        let socket = self.parameters.socket()?;
+        let listener = Listener::bind(socket, self.tls.clone())
+            .await
+            .with_context(|| format!("parameters address and port: cannot listen on {socket}"))?;
+        let address = listener.address();
+        let tls = self.tls.is_some();
+        let scheme = if tls { "https" } else { "http" };
+        let page = format!("{scheme}://{address}/#token={}", self.token);
+        if self.parameters.address_file == Path::new("") {
+            // Standard output may be a program's result.
+            eprintln!("operator console: {page}");
+        } else {
+            write_address(&self.parameters.address_file, &page)?;
+        }
+        // Logs go to every node: never the token.
+        info!("the operator's page is served on {scheme}://{address}/");
+        node.diagnostics().set(
+            "page",
+            Level::Ok,
+            format!("served on {scheme}://{address}/"),
+            [],
+        );
+        let access = Access::new(
+            self.token.clone(),
+            address,
+            &self.parameters.host_names,
+            tls,
+        );
+        let router = server::router(
+            Arc::clone(&self.console),
+            Arc::clone(&self.library),
+            access,
+            end.clone(),
+        );
+        let ended = end.clone().cancelled_owned();
+        tokio::spawn(async move {
+            let served = axum::serve(listener, router).with_graceful_shutdown(ended);
+            if let Err(error) = served.await {
+                warn!("the page is no longer served: {error}");
+            }
+        });
+        Ok(())
+    }
+
+    fn carry_out(&self, node: &Node, command: Command) {
+        match command {
+            Command::Confirm(mut confirmation) => {
+                confirmation.header.stamp = node.now();
+                let StepConfirmation {
+                    proposal_id,
+                    decision,
+                    operator_name,
+                    ..
+                } = &confirmation;
+                info!("`{operator_name}`: decision {decision} on proposal {proposal_id}");
+                self.confirmations.publish(confirmation);
+            }
+            Command::Propose(proposal) => {
+                info!("an operator's proposal {}", proposal.id);
+                self.proposals.publish(*proposal);
+            }
+            Command::Home(name) => {
+                info!("`{name}`: home");
+                let (client, console) = (Arc::clone(&self.home), Arc::clone(&self.console));
+                node.spawn(async move {
+                    let answer = client.call(&TriggerRequest::default(), &HOME_TIMEOUT).await;
+                    let (kind, reason) = match answer {
+                        Ok(answer) if answer.success => ("note", "The arm is at home.".to_owned()),
+                        Ok(answer) => (
+                            "refusal",
+                            format!("The arm did not go home: {}", answer.message),
+                        ),
+                        Err(error) => ("refusal", format!("The arm did not go home: {error}")),
+                    };
+                    let advice = match kind {
+                        "note" => "",
+                        _ => refusal::advice(&reason),
+                    };
+                    console.change(|state, now| state.run.note(kind, reason, advice, now));
+                });
+            }
+            Command::Load(path, name) => {
+                info!("`{name}`: repeat {}", path.display());
+                let (client, console) = (Arc::clone(&self.load), Arc::clone(&self.console));
+                let request = LoadDemonstrationRequest {
+                    request_id: secret(),
+                    path: path.display().to_string(),
+                };
+                node.spawn(async move {
+                    let answer = client.call(&request, &CallOptions::default()).await;
+                    let (kind, reason, advice) = match answer {
+                        Ok(answer) if answer.success => {
+                            ("note", format!("The run repeats {}.", answer.message), "")
+                        }
+                        Ok(answer) => (
+                            "refusal",
+                            format!("The demonstration was not loaded: {}", answer.message),
+                            CHOOSE_ANOTHER,
+                        ),
+                        Err(error) => (
+                            "refusal",
+                            format!("The demonstration was not loaded: {error}"),
+                            CHOOSE_ANOTHER,
+                        ),
+                    };
+                    console.change(|state, now| state.run.note(kind, reason, advice, now));
+                });
+            }
+            Command::SetStep(step, name) => {
+                info!("`{name}`: continue with step {step}");
+                let (client, console) = (Arc::clone(&self.set_step), Arc::clone(&self.console));
+                let request = SetStepRequest {
+                    request_id: secret(),
+                    step,
+                };
+                node.spawn(async move {
+                    let reason = match client.call(&request, &CallOptions::default()).await {
+                        Ok(answer) if answer.success => return,
+                        Ok(answer) => answer.message,
+                        Err(error) => error.to_string(),
+                    };
+                    console.change(|state, now| {
+                        let advice = "Look whether the goal oracle is at work.";
+                        let reason = format!("The run did not continue: {reason}");
+                        state.run.note("refusal", reason, advice, now);
+                    });
+                });
+            }
+        }
+    }
+}
+
+/// Whole or not at all, for the owner alone: it holds the token.
+fn write_address(path: &Path, page: &str) -> anyhow::Result<()> {
+    let shown = || format!("parameter address_file: {}", path.display());
+    let mut partial = path.as_os_str().to_owned();
+    partial.push(".partial");
+    let mut options = OpenOptions::new();
+    options.write(true).create(true).truncate(true).mode(0o600);
+    let mut file = options.open(&partial).with_context(shown)?;
+    writeln!(file, "{page}").with_context(shown)?;
+    std::fs::rename(&partial, path).with_context(shown)
+}
+
+fn level(states: &[Digital], pin: u8) -> Option<bool> {
+    let mut states = states.iter();
+    states
+        .find(|state| state.pin == pin)
+        .map(|state| state.state)
+}

@@ -1,0 +1,148 @@
+//! The folder of demonstrations that can be repeated.
+
+use std::collections::BTreeMap;
+use std::path::{Path, PathBuf};
+use std::sync::{Mutex, PoisonError};
+use std::time::{SystemTime, UNIX_EPOCH};
+
+use bags::Demonstration;
+use heightmap::Heightmap;
+use serde::Serialize;
+
+use crate::lesson::check_name;
+use crate::refusal::Refusal;
+
+/// Most demonstrations that are listed.
+const MOST: usize = 1000;
+
+/// A demonstration in the library.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Entry {
+    /// Name of its folder.
+    pub name: String,
+    /// Name of its problem.
+    pub problem: String,
+    /// Number of its steps.
+    pub step_count: usize,
+    /// When it was saved: seconds since 1970.
+    pub saved_at_s: u64,
+}
+
+/// The demonstrations of a folder.
+#[derive(Debug)]
+pub struct Library {
+    folder: PathBuf,
+    /// What was read, and when the folder had been changed then.
+    known: Mutex<BTreeMap<String, (SystemTime, Option<Entry>)>>,
+}
+
+impl Library {
+    /// The folder need not be there yet.
+    pub fn new(folder: PathBuf) -> Self {
+        Self {
+            folder,
+            known: Mutex::default(),
+        }
+    }
+
+    /// Where a demonstration is, or would be.
+    ///
+    /// # Errors
+    /// When the name cannot be that of a demonstration.
+    pub fn path(&self, name: &str) -> Result<PathBuf, Refusal> {
+        check_name(name)?;
+        std::path::absolute(self.folder.join(name)).map_err(|error| {
+            Refusal::new(
+                format!("{}: {error}.", self.folder.display()),
+                "Look at the parameter library.",
+            )
+        })
+    }
+
+    /// All demonstrations, newest first. What is in the folder and is none is left out. Reads files.
+    pub fn list(&self) -> Vec<Entry> {
+        let mut known = self.known.lock().unwrap_or_else(PoisonError::into_inner);
+        let Ok(folders) = std::fs::read_dir(&self.folder) else {
+            return Vec::new();
+        };
+        let mut entries = Vec::new();
+        for folder in folders.flatten().take(MOST) {
+            let name = folder.file_name().to_string_lossy().into_owned();
+            let changed = folder.metadata().and_then(|metadata| metadata.modified());
+            let (Ok(changed), Ok(())) = (changed, check_name(&name)) else {
+                continue;
+            };
+            let is_known = known.get(&name).is_some_and(|(at, _)| *at == changed);
+            if !is_known {
+                let entry = read_entry(&folder.path(), &name, changed);
+                known.insert(name.clone(), (changed, entry));
+            }
+            entries.extend(known.get(&name).and_then(|(_, entry)| entry.clone()));
+        }
+        entries.sort_by(|a, b| (b.saved_at_s, &a.name).cmp(&(a.saved_at_s, &b.name)));
+        entries
+    }
+
+    /// What was seen before the first step (0) or after a step (from 1). Reads files.
+    ///
+    /// # Errors
+    /// When there is no such demonstration or step.
+    pub fn picture(&self, name: &str, step: usize) -> Result<Heightmap, Refusal> {
+        let demonstration = self.read(name)?;
+        if step > demonstration.steps.len() {
+            return Err(Refusal::new(
+                format!("{name} has no step {step}."),
+                "Ask for a step of the demonstration.",
+            ));
+        }
+        Ok(demonstration.observation(step).clone())
+    }
+
+    fn read(&self, name: &str) -> Result<Demonstration, Refusal> {
+        Demonstration::read(&self.path(name)?).map_err(|error| {
+            Refusal::new(
+                format!("The demonstration {name} cannot be read: {error}."),
+                "Choose another one.",
+            )
+        })
+    }
+
+    /// Saves a demonstration under a name that is not taken. Writes files.
+    ///
+    /// # Errors
+    /// When the name is taken or cannot be written.
+    pub fn save(&self, name: &str, demonstration: &Demonstration) -> Result<(), Refusal> {
+        let path = self.path(name)?;
+        let failed = |error: String| {
+            Refusal::new(
+                format!("The demonstration was not saved: {error}."),
+                "Look at the parameter library and at the disk, then save again.",
+            )
+        };
+        if path.exists() {
+            return Err(Refusal::new(
+                format!("There is a demonstration {name} already."),
+                "Type another name.",
+            ));
+        }
+        std::fs::create_dir_all(&self.folder)
+            .map_err(|error| failed(format!("{}: {error}", self.folder.display())))?;
+        demonstration
+            .write(&path)
+            .map_err(|error| failed(error.to_string()))
+    }
+}
+
+fn read_entry(path: &Path, name: &str, changed: SystemTime) -> Option<Entry> {
+    let demonstration = Demonstration::read(path).ok()?;
+    let saved_at_s = changed
+        .duration_since(UNIX_EPOCH)
+        .unwrap_or_default()
+        .as_secs();
+    Some(Entry {
+        name: name.to_owned(),
+        step_count: demonstration.goals().len(),
+        problem: demonstration.problem,
+        saved_at_s,
+    })
+}

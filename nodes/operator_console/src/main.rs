@@ -1,0 +1,7 @@
+//! The operator_console node.
+
+use std::process::ExitCode;
+
+fn main() -> ExitCode {
+    node_kit::main("operator_console", operator_console::configure)
+}

@@ -1,0 +1,390 @@
+use super::*;
+use msgs::diagnostic_msgs::{DiagnosticStatus, KeyValue};
+use msgs::geometry_msgs::Pose2D;
+use msgs::sctn_msgs::PrimitiveSettings;
+use serde_bytes::ByteBuf;
+
+const SETTINGS: PrimitiveSettings = PrimitiveSettings {
+    clearance_m: 0.1,
+    lift_m: 0.1,
+    travel_m_s: 1.0,
+    carry_m_s: 1.0,
+    descend_m_s: 0.1,
+    acceleration_m_s2: 1.0,
+};
+const NOW: Duration = Duration::from_secs(100);
+
+fn stamp(sec: i32) -> Time {
+    Time { sec, nanosec: 0 }
+}
+
+fn heightmap(sec: i32, height_m: f32) -> Heightmap {
+    let mut message = Heightmap {
+        rows: 4,
+        cols: 3,
+        pixel_size_m: 0.1,
+        rgb: ByteBuf::from(vec![0; 36]),
+        height_m: vec![height_m; 12],
+        ..Heightmap::default()
+    };
+    message.header.stamp = stamp(sec);
+    message
+}
+
+fn goal(step: u32, attempt: u32, sec: i32) -> Goal {
+    let mut message = Goal {
+        problem: "stacking".into(),
+        demonstration: "stacking/10000".into(),
+        step,
+        step_count: 2,
+        attempt,
+        settings: SETTINGS,
+        heightmap: heightmap(0, 0.01 * step as f32),
+        ..Goal::default()
+    };
+    message.header.stamp = stamp(sec);
+    message
+}
+
+fn proposal(id: u64, step: u32, attempt: u32, sec: i32) -> PickPlace {
+    let pose = Pose2D {
+        x: 0.15,
+        y: 0.15,
+        theta: 0.0,
+    };
+    let mut message = PickPlace {
+        id,
+        problem: "stacking".into(),
+        step,
+        attempt,
+        pick: pose,
+        place: pose,
+        settings: SETTINGS,
+        ..PickPlace::default()
+    };
+    message.header.stamp = stamp(sec);
+    message
+}
+
+fn confirmation(proposal_id: u64, decision: Decision) -> StepConfirmation {
+    StepConfirmation {
+        proposal_id,
+        decision: decision.to_msg(),
+        operator_name: "Ada".into(),
+        ..StepConfirmation::default()
+    }
+}
+
+fn result(proposal_id: u64, outcome: u8, sec: i32) -> StepResult {
+    let mut message = StepResult {
+        proposal_id,
+        outcome,
+        reason: "for a reason".into(),
+        ..StepResult::default()
+    };
+    message.header.stamp = stamp(sec);
+    if !matches!(outcome, StepResult::REFUSED | StepResult::REJECTED) {
+        message.duration.sec = 5;
+    }
+    message
+}
+
+/// Diagnostics of a node that hears a camera, whose newest image is of this age.
+fn diagnostics(node: &str, state: &str, message: &str, age: &str) -> DiagnosticArray {
+    let status = |state: &str, message: &str, values| DiagnosticStatus {
+        name: format!("{node}: {state}"),
+        message: message.to_owned(),
+        values,
+        ..DiagnosticStatus::default()
+    };
+    let image = KeyValue {
+        key: "/front/color/image_raw".into(),
+        value: format!("in messages=9 rate_hz=1.0 age_s={age} dropped=0 errors=0"),
+    };
+    let own = KeyValue {
+        key: "/heightmap".into(),
+        value: "out messages=9 rate_hz=0.0 age_s=50.0 dropped=0 errors=0".into(),
+    };
+    DiagnosticArray {
+        status: vec![
+            status("topics", "all messages arrive whole", vec![image, own]),
+            status(state, message, Vec::new()),
+        ],
+        ..DiagnosticArray::default()
+    }
+}
+
+/// A run in which all streams are fresh.
+fn fresh() -> Run {
+    let mut run = Run::new(Watch {
+        nodes: vec!["/camera_fusion".into(), "/suction_executor".into()],
+        executor: "/suction_executor".into(),
+        stale_after: Duration::from_secs(3),
+    });
+    run.on_diagnostics(
+        diagnostics("/camera_fusion", "camera front", "ok", "0.5"),
+        NOW,
+    );
+    let mut executor = diagnostics("/suction_executor", "driver", "ready", "0.5");
+    executor.status[0].values.clear();
+    run.on_diagnostics(executor, NOW);
+    run.on_joints(vec!["elbow".into()], vec![0.0], NOW);
+    run
+}
+
+/// A run with an open proposal 7 for step 1.
+fn proposed() -> Run {
+    let mut run = fresh();
+    run.on_heightmap(heightmap(10, 0.0), NOW).unwrap();
+    run.on_goal(goal(1, 0, 0), NOW).unwrap();
+    run.on_proposal(proposal(7, 1, 0, 10)).unwrap();
+    run
+}
+
+#[test]
+fn a_run_goes_from_proposal_to_approval_motion_confirmation_and_its_end() {
+    let mut run = fresh();
+    assert_eq!(run.phase(), Phase::NoGoal);
+    run.on_heightmap(heightmap(10, 0.0), NOW).unwrap();
+    run.on_goal(goal(1, 0, 0), NOW).unwrap();
+    assert_eq!(run.phase(), Phase::AwaitingProposal);
+    run.on_proposal(proposal(7, 1, 0, 10)).unwrap();
+    assert_eq!((run.phase(), run.current_id()), (Phase::Proposed, Some(7)));
+    run.check(Decision::Approve, NOW).unwrap();
+    run.on_confirmation(&confirmation(7, Decision::Approve));
+    assert_eq!(run.phase(), Phase::Moving);
+    run.check(Decision::Approve, NOW).unwrap_err();
+    run.check(Decision::Stop, NOW).unwrap();
+    run.on_result(&result(7, StepResult::PLACED, 20), NOW)
+        .unwrap();
+    assert_eq!(run.phase(), Phase::AwaitingConfirmation);
+    run.check(Decision::Advance, NOW).unwrap();
+    run.on_heightmap(heightmap(21, 0.1), NOW).unwrap();
+    run.on_confirmation(&confirmation(7, Decision::Advance));
+    assert_eq!(run.phase(), Phase::AwaitingProposal);
+    let (before, after) = run.past_step(1).unwrap();
+    assert_eq!((before.unwrap().number, after.unwrap().number), (1, 2));
+    let mut last = goal(2, 0, 20);
+    last.complete = true;
+    run.on_goal(last, NOW).unwrap();
+    assert_eq!(run.phase(), Phase::Complete);
+    run.check(Decision::Stop, NOW).unwrap_err();
+}
+
+#[test]
+fn a_proposal_that_comes_before_its_goal_is_shown_with_it() {
+    let mut run = proposed();
+    run.on_proposal(proposal(8, 2, 0, 20)).unwrap();
+    assert_eq!(run.phase(), Phase::AwaitingProposal);
+    run.on_goal(goal(2, 0, 20), NOW).unwrap();
+    assert_eq!((run.phase(), run.current_id()), (Phase::Proposed, Some(8)));
+}
+
+#[test]
+fn a_refused_approval_opens_the_proposal_again_and_says_why_and_what_to_do() {
+    let mut run = proposed();
+    run.on_confirmation(&confirmation(7, Decision::Approve));
+    let mut refusal = result(7, StepResult::REFUSED, 11);
+    refusal.reason = "proposal 7: the observation has changed since".into();
+    run.on_result(&refusal, NOW).unwrap();
+    assert_eq!(run.phase(), Phase::Proposed);
+    let json = serde_json::to_value(run.snapshot(NOW)).unwrap();
+    assert_eq!(json["notices"][0]["kind"], "refusal");
+    let advice = json["notices"][0]["advice"].as_str().unwrap();
+    assert!(advice.contains("new proposal"), "{advice}");
+}
+
+#[test]
+fn a_refused_advance_asks_again_whether_the_step_succeeded() {
+    let mut run = proposed();
+    run.on_confirmation(&confirmation(7, Decision::Approve));
+    run.on_result(&result(7, StepResult::DROPPED, 20), NOW)
+        .unwrap();
+    run.on_confirmation(&confirmation(7, Decision::Retry));
+    run.on_result(&result(7, StepResult::REFUSED, 21), NOW)
+        .unwrap();
+    assert_eq!(run.phase(), Phase::AwaitingConfirmation);
+}
+
+#[test]
+fn a_rejected_proposal_is_not_open_when_it_is_published_again() {
+    let mut run = proposed();
+    run.on_confirmation(&confirmation(7, Decision::Reject));
+    run.on_result(&result(7, StepResult::REJECTED, 10), NOW)
+        .unwrap();
+    run.on_proposal(proposal(7, 1, 0, 10)).unwrap();
+    assert_eq!(run.phase(), Phase::AwaitingProposal);
+    run.on_goal(goal(1, 1, 0), NOW).unwrap();
+    run.on_proposal(proposal(8, 1, 1, 10)).unwrap();
+    assert_eq!((run.phase(), run.current_id()), (Phase::Proposed, Some(8)));
+}
+
+#[test]
+fn a_stop_holds_until_a_goal_is_latched_again() {
+    let mut run = proposed();
+    run.on_confirmation(&confirmation(7, Decision::Approve));
+    run.on_confirmation(&confirmation(7, Decision::Stop));
+    assert_eq!(run.phase(), Phase::Stopped);
+    run.on_result(&result(7, StepResult::STOPPED, 15), NOW)
+        .unwrap();
+    assert_eq!(run.phase(), Phase::Stopped);
+    run.check(Decision::Approve, NOW).unwrap_err();
+    // The same goal latched once more is no new one.
+    run.on_goal(goal(1, 0, 0), NOW).unwrap();
+    assert_eq!(run.phase(), Phase::Stopped);
+    run.on_goal(goal(1, 1, 15), NOW).unwrap();
+    assert_eq!(run.phase(), Phase::AwaitingProposal);
+}
+
+#[test]
+fn after_a_fault_the_step_can_be_tried_again() {
+    let mut run = proposed();
+    run.on_confirmation(&confirmation(7, Decision::Approve));
+    run.on_result(&result(7, StepResult::FAULT, 15), NOW)
+        .unwrap();
+    assert_eq!(run.phase(), Phase::Fault);
+    run.check(Decision::Retry, NOW).unwrap();
+    let json = serde_json::to_value(run.snapshot(NOW)).unwrap();
+    assert!(
+        json["notices"][0]["reason"]
+            .as_str()
+            .unwrap()
+            .contains("For a reason.")
+    );
+}
+
+#[test]
+fn what_is_stale_cannot_be_approved_but_can_be_stopped() {
+    let late = NOW + Duration::from_secs(4);
+    let run = proposed();
+    let refusal = run.check(Decision::Approve, late).unwrap_err();
+    assert!(
+        refusal.reason.contains("camera_fusion is stale"),
+        "{refusal:?}"
+    );
+    run.check(Decision::Reject, late).unwrap();
+    run.check(Decision::Stop, late).unwrap();
+
+    // The node lives, and its camera has fallen silent.
+    let mut run = proposed();
+    run.on_diagnostics(
+        diagnostics("/camera_fusion", "camera front", "ok", "3.5"),
+        NOW,
+    );
+    let refusal = run.check(Decision::Approve, NOW).unwrap_err();
+    assert!(
+        refusal.reason.contains("front/color/image_raw"),
+        "{refusal:?}"
+    );
+    run.on_diagnostics(
+        diagnostics("/camera_fusion", "camera front", "ok", "never"),
+        NOW,
+    );
+    let refusal = run.check(Decision::Approve, NOW).unwrap_err();
+    assert!(refusal.reason.contains("Nothing has come"), "{refusal:?}");
+    run.on_diagnostics(
+        diagnostics("/camera_fusion", "camera front", "ok", "0.1"),
+        NOW,
+    );
+    run.check(Decision::Approve, NOW).unwrap();
+}
+
+#[test]
+fn nothing_is_approved_while_the_robot_is_not_ready() {
+    let mut run = proposed();
+    let stopped = "safety mode is PROTECTIVE_STOP, expected NORMAL or REDUCED";
+    let mut executor = diagnostics("/suction_executor", "driver", stopped, "0.5");
+    executor.status[0].values.clear();
+    run.on_diagnostics(executor, NOW);
+    let refusal = run.check(Decision::Approve, NOW).unwrap_err();
+    assert!(refusal.reason.contains("PROTECTIVE_STOP"), "{refusal:?}");
+    assert!(refusal.advice.contains("teach pendant"), "{refusal:?}");
+}
+
+#[test]
+fn a_message_that_cannot_be_shown_is_named_by_its_field_and_changes_nothing() {
+    let mut run = proposed();
+    let mut short = heightmap(11, 0.0);
+    short.rgb.pop();
+    let error = run.on_heightmap(short, NOW).unwrap_err();
+    assert!(error.starts_with("rgb has 35"), "{error}");
+    let mut infinite = heightmap(11, 0.0);
+    infinite.pixel_size_m = f64::INFINITY;
+    assert!(
+        run.on_heightmap(infinite, NOW)
+            .unwrap_err()
+            .contains("pixel_size_m")
+    );
+    let error = run.on_goal(goal(3, 0, 11), NOW).unwrap_err();
+    assert!(error.contains("step is 3"), "{error}");
+    let mut outside = proposal(8, 1, 0, 10);
+    outside.place.x = 9.0;
+    let error = run.on_proposal(outside).unwrap_err();
+    assert!(error.contains("place is (9.000"), "{error}");
+    let mut nowhere = proposal(8, 1, 0, 10);
+    nowhere.pick.y = f64::NAN;
+    assert!(run.on_proposal(nowhere).unwrap_err().starts_with("pick"));
+    assert_eq!((run.phase(), run.current_id()), (Phase::Proposed, Some(7)));
+}
+
+#[test]
+fn the_demonstration_strip_holds_what_was_latched_and_begins_anew_with_another() {
+    let mut run = proposed();
+    run.on_goal(goal(2, 0, 20), NOW).unwrap();
+    assert!(run.strip(1).is_some() && run.strip(2).is_some());
+    let mut other = goal(1, 0, 30);
+    other.demonstration = "stacking/10002".into();
+    run.on_goal(other, NOW).unwrap();
+    assert!(run.strip(1).is_some() && run.strip(2).is_none());
+}
+
+#[test]
+fn a_correction_is_a_proposal_for_the_present_goal_from_the_newest_view() {
+    let mut run = proposed();
+    let pose = |x_m, yaw_rad| Pose {
+        x_m,
+        y_m: 0.2,
+        yaw_rad,
+    };
+    let corrected = run.correction(pose(0.1, 0.0), pose(0.2, 0.5)).unwrap();
+    assert_eq!((corrected.step, corrected.attempt), (1, 0));
+    assert_eq!(corrected.header.stamp, stamp(10));
+    assert_eq!((corrected.place.x, corrected.place.theta), (0.2, 0.5));
+    let id = corrected.id;
+    run.on_proposal(corrected).unwrap();
+    assert_eq!((run.phase(), run.current_id()), (Phase::Proposed, Some(id)));
+    // The same one again would be taken for a repetition.
+    run.correction(pose(0.1, 0.0), pose(0.2, 0.5)).unwrap_err();
+    assert_ne!(
+        run.correction(pose(0.1, 0.0), pose(0.2, 0.6)).unwrap().id,
+        id
+    );
+    let refusal = run.correction(pose(9.0, 0.0), pose(0.2, 0.5)).unwrap_err();
+    assert!(refusal.reason.contains("pick lies outside"), "{refusal:?}");
+    run.correction(pose(0.1, 0.0), pose(f64::NAN, 0.5))
+        .unwrap_err();
+
+    // The policy proposes again once the arm has moved; the operator still judges the corrected step.
+    run.on_confirmation(&confirmation(id, Decision::Approve));
+    run.correction(pose(0.1, 0.0), pose(0.2, 0.7)).unwrap_err();
+    run.on_result(&result(id, StepResult::PLACED, 20), NOW)
+        .unwrap();
+    run.on_proposal(proposal(9, 1, 0, 21)).unwrap();
+    assert_eq!(
+        (run.phase(), run.current_id()),
+        (Phase::AwaitingConfirmation, Some(id))
+    );
+}
+
+#[test]
+fn a_stop_without_a_proposal_ends_the_run_without_a_refusal() {
+    let mut run = fresh();
+    run.on_heightmap(heightmap(10, 0.0), NOW).unwrap();
+    run.on_goal(goal(1, 0, 0), NOW).unwrap();
+    run.on_confirmation(&confirmation(0, Decision::Stop));
+    run.on_result(&result(0, StepResult::REFUSED, 10), NOW)
+        .unwrap();
+    assert_eq!(run.phase(), Phase::Stopped);
+    let json = serde_json::to_value(run.snapshot(NOW)).unwrap();
+    assert_eq!(json["notices"].as_array().unwrap().len(), 0);
+}

@@ -1,0 +1,102 @@
+"""A person at the operator's page, in a real browser: Debian's Chromium, driven by Playwright."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+import pytest
+from axe_playwright_python.sync_playwright import Axe
+from playwright.sync_api import Browser, Locator, Page, expect, sync_playwright
+from processes import Process
+
+CHROMIUM = next((found for name in ("chromium", "chromium-browser", "google-chrome") if (found := shutil.which(name))), None)
+
+# Two busy cores: a policy, a simulator and a browser beside each other.
+PATIENCE_MS = 60_000
+expect.set_options(timeout=PATIENCE_MS)
+
+
+@contextmanager
+def chromium() -> Iterator[Browser]:
+    """A running Chromium; the test is skipped where there is none, and fails there where CI is set."""
+    if CHROMIUM is None:
+        reason = "not checked: the operator's page, for want of Chromium (Debian: apt install chromium)"
+        if os.environ.get("CI"):
+            pytest.fail(reason)
+        pytest.skip(reason)
+    with sync_playwright() as playwright:
+        # The sandbox needs rights that containers do not give.
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox", "--disable-gpu"])
+        try:
+            yield browser
+        finally:
+            browser.close()
+
+
+def address_of(launch: Process, until: Callable[[Callable[[], object], str, float], object]) -> str:
+    """The address that `sctn launch --operator web` or `sctn console` has printed."""
+
+    def printed() -> str | None:
+        found = re.search(r"^operator console: (\S+)$", launch.output() + launch.errors(), re.MULTILINE)
+        assert launch.exit_code is None, launch.log()
+        return found and found.group(1)
+
+    return until(printed, "address of the operator's page", 90.0)
+
+
+class Person:
+    """Somebody at the page. Everything is found by what a person reads, and can be done by keyboard alone."""
+
+    def __init__(self, browser: Browser, address: str, name: str, width: int = 1440, height: int = 1000) -> None:
+        self.name = name
+        self.context = browser.new_context(viewport={"width": width, "height": height})
+        self.page: Page = self.context.new_page()
+        self.errors: list[str] = []
+        self.page.on("pageerror", lambda error: self.errors.append(str(error)))
+        self.page.on("console", lambda said: self.errors.append(said.text) if said.type == "error" else None)
+        self.page.goto(address)
+        # The dialogue has the focus: a person types and presses Enter.
+        expect(self.page.get_by_label("Name", exact=True)).to_be_focused()
+        self.page.keyboard.type(name)
+        self.page.keyboard.press("Enter")
+        expect(self.page.get_by_role("status").filter(has_text="Connected")).to_be_visible()
+
+    def button(self, name: str) -> Locator:
+        """A button by its words."""
+        return self.page.get_by_role("button", name=name)
+
+    def reads(self, text: str | re.Pattern[str]) -> None:
+        """Waits until the headline says this."""
+        expect(self.page.get_by_role("heading", level=2).first).to_contain_text(text)
+
+    def headline(self) -> str:
+        """What the headline says now."""
+        return self.page.get_by_role("heading", level=2).first.inner_text()
+
+    def can(self, name: str) -> None:
+        """Waits until a button can be pressed."""
+        expect(self.button(name)).to_be_enabled()
+
+    def cannot(self, name: str) -> None:
+        """Waits until a button is there and cannot be pressed."""
+        expect(self.button(name)).to_be_disabled()
+
+    def takes_control(self, over: str | None = None) -> None:
+        """Takes control, from somebody or where nobody decides."""
+        self.button(f"Take control from {over}" if over else "Take control").click()
+        expect(self.page.get_by_text("You decide", exact=True)).to_be_visible()
+
+    def finds_no_barrier(self) -> None:
+        """axe-core finds nothing serious: names, roles, contrast, focus."""
+        found = Axe().run(self.page).response["violations"]
+        serious = [(one["id"], [node["html"] for node in one["nodes"]]) for one in found if one["impact"] in ("serious", "critical")]
+        assert serious == []
+
+    def close(self) -> None:
+        """Leaves; nothing went wrong on the page."""
+        assert self.errors == []
+        self.context.close()

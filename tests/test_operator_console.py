@@ -1,0 +1,324 @@
+"""The operator's page in a real browser, its API with a program, and what is hostile to both."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+import os
+import pathlib
+import random
+import re
+import signal
+import socket
+import sys
+import time
+import urllib.parse
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+from browser import Person, address_of, chromium
+from cell_operator import EVENT, Operator, nanoseconds
+from playwright.sync_api import Browser, expect
+from processes import REPOSITORY, Process
+from rcl_interfaces.srv import SetParameters
+from rclpy.parameter import Parameter
+from sctn_msgs.msg import StepConfirmation, StepResult
+
+STEPS = 6
+
+
+def console_client() -> Any:
+    """The example client as a module."""
+    path = REPOSITORY / "docs/examples/operator_console.py"
+    specification = importlib.util.spec_from_file_location("operator_console_client", path)
+    module = importlib.util.module_from_spec(specification)
+    sys.modules[specification.name] = module
+    specification.loader.exec_module(module)
+    return module
+
+
+CLIENT = console_client()
+
+
+def until(condition: Callable[[], Any], what: str, timeout_s: float) -> Any:
+    """Waits for a condition that needs no node."""
+    end = time.monotonic() + timeout_s
+    while not (found := condition()):
+        assert time.monotonic() < end, f"no {what} within {timeout_s} s"
+        time.sleep(0.05)
+    return found
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    """One browser for all tests."""
+    with chromium() as running:
+        yield running
+
+
+@pytest.fixture
+def decided(operator: Operator) -> Callable[[], list[StepConfirmation]]:
+    """What operators have decided, as the graph hears it, after a last look."""
+    heard: list[StepConfirmation] = []
+    operator.node.create_subscription(StepConfirmation, "step_confirmation", heard.append, EVENT)
+
+    def look() -> list[StepConfirmation]:
+        operator.spin(0.3)
+        return heard
+
+    return look
+
+
+def launch_web(start: Callable[..., Process], seed: int, *arguments: object) -> tuple[Process, str]:
+    """A run of stacking that waits for a person, and the address of the page."""
+    launch = start("sctn", "launch", "--problem", "stacking", "--seed", seed, "--operator", "web", *arguments)
+    return launch, address_of(launch, until)
+
+
+def program(launch: Process, name: str) -> int:
+    """Process id of a node that was launched as a process of its own."""
+    for pid in launch.descendants():
+        if pathlib.Path(f"/proc/{pid}/cmdline").read_bytes().split(b"\0")[0].endswith(f"/{name}".encode()):
+            return pid
+    raise AssertionError(f"{name} does not run")
+
+
+def slow_down(operator: Operator, factor: float) -> None:
+    """Simulated seconds for each second: a person can stop a motion only where it takes time."""
+    client = operator.node.create_client(SetParameters, "sim_workcell/set_parameters")
+    operator.until(client.service_is_ready, "sim_workcell", 30.0)
+    value = Parameter("real_time_factor", Parameter.Type.DOUBLE, factor).to_parameter_msg()
+    answer = client.call_async(SetParameters.Request(parameters=[value]))
+    operator.until(answer.done, "answer of sim_workcell", 30.0)
+    assert answer.result().results[0].successful
+
+
+def test_a_person_rejects_once_and_then_approves_a_run_of_stacking_to_its_end_by_keyboard(
+    browser: Browser, start, operator: Operator, decided
+) -> None:
+    launch, address = launch_web(start, 10000)
+    ada = Person(browser, address, "Ada")
+    ada.button("Take control").focus()
+    ada.page.keyboard.press("Enter")
+    ada.reads("Step 1 of 6: the policy proposes")
+    ada.can("Approve")
+    ada.finds_no_barrier()
+    ada.page.keyboard.press("r")
+    ada.reads("Step 1 of 6, attempt 2")
+    keys = 0
+    question = re.compile("proposes|succeed|All steps")
+    done = 0
+    while done < STEPS:
+        ada.reads(question)
+        headline = ada.headline()
+        if "proposes" in headline:
+            ada.can("Approve")
+            key = "a"
+        else:
+            # A person sees whether the step succeeded; the test asks the simulator.
+            proposed = operator.next("pick_place", accept=lambda proposal: proposal.step == done + 1)
+            proposed = next(one for one in reversed(operator.received["pick_place"]) if one.step == proposed.step)
+            seen = nanoseconds(proposed.header.stamp)
+            reward = operator.next("reward", accept=lambda reward: nanoseconds(reward.header.stamp) > seen, timeout_s=30.0)
+            done += reward.delta > 0
+            key = "n" if reward.delta > 0 else "t"
+            ada.can("It succeeded")
+        keys += 1
+        ada.page.keyboard.press(key)
+        expect(ada.page.get_by_role("heading", level=2).first).not_to_have_text(headline)
+        assert keys < 40, ada.headline()
+    ada.reads("All steps are done")
+    ada.close()
+    assert launch.wait(60.0) == 0, launch.log()
+    assert "completed" in launch.output()
+    # Each decision was heard on the graph, by name.
+    said = decided()
+    assert said[0].decision == StepConfirmation.REJECT
+    assert {one.operator_name for one in said} == {"Ada"}
+
+
+def test_a_motion_is_stopped_and_the_run_goes_on_and_a_second_browser_takes_over(
+    browser: Browser, start, operator: Operator, decided
+) -> None:
+    launch, address = launch_web(start, 10002, "--processes")
+    ada, bob = Person(browser, address, "Ada"), Person(browser, address, "Bob", width=390, height=844)
+    ada.takes_control()
+    expect(bob.page.get_by_text("You watch. Ada decides")).to_be_visible()
+    ada.reads("proposes")
+    ada.can("Approve")
+    bob.cannot("Approve")
+    expect(bob.page.get_by_text("Ada decides. You are watching.")).to_be_visible()
+
+    # A camera's images stop, as does the node that fuses them: nothing can be approved until it is back.
+    fusion = program(launch, "camera_fusion")
+    os.kill(fusion, signal.SIGSTOP)
+    ada.cannot("Approve")
+    expect(ada.page.get_by_role("status").filter(has_text="camera_fusion is stale")).to_be_visible()
+    os.kill(fusion, signal.SIGCONT)
+    ada.can("Approve")
+
+    # Stopped in mid-motion, by button.
+    slow_down(operator, 1.0)
+    ada.button("Approve").click()
+    ada.reads("the arm moves")
+    results = operator.count("step_result")
+    ada.button("Stop").click()
+    ada.reads("stopped")
+    assert operator.next("step_result", results).outcome == StepResult.STOPPED
+    slow_down(operator, 0.0)
+    ada.button("Arm home").click()
+    expect(ada.page.get_by_text("The arm is at home.")).to_be_visible()
+    ada.button("Continue").click()
+    ada.reads("proposes")
+
+    # Another one takes over; the first can no longer approve.
+    bob.takes_control(over="Ada")
+    expect(ada.page.get_by_text("Bob decides. You are watching.")).to_be_visible()
+    ada.cannot("Approve")
+    approvals = len(decided())
+    ada.page.keyboard.press("a")
+    # The link is lost and regained; who decides stays.
+    bob.page.reload()
+    expect(bob.page.get_by_text("You decide", exact=True)).to_be_visible()
+    bob.can("Approve")
+
+    # Another place than the policy's, by hand: a proposal that is approved as every other.
+    bob.button("Correct…").click()
+    place_x = bob.page.get_by_label("Place x")
+    place_x.fill(str(round(1000 * operator.newest("pick_place").place.x) + 10))
+    proposals = operator.count("pick_place")
+    bob.button("Propose this").click()
+    corrected = operator.next("pick_place", proposals)
+    assert round(1000 * corrected.place.x) == int(place_x.input_value())
+    bob.can("Approve")
+    bob.button("Approve").click()
+    bob.reads("did it succeed")
+    said = decided()[approvals:]
+    assert [(one.proposal_id, one.decision, one.operator_name) for one in said] == [(corrected.id, StepConfirmation.APPROVE, "Bob")]
+    ada.close()
+    bob.close()
+
+
+def test_a_task_is_taught_by_clicks_saved_and_repeated(browser: Browser, start, operator: Operator, tmp_path: pathlib.Path) -> None:
+    _, address = launch_web(start, 10008, "--library", tmp_path / "library")
+    ada = Person(browser, address, "Ada")
+    ada.takes_control()
+    ada.reads("proposes")
+    # Where the policy would pick there is a block, and where it would place there is room for it.
+    proposed = operator.next("pick_place")
+    ada.button("Teach a new task").click()
+    ada.reads("Teaching a new task")
+    ada.finds_no_barrier()
+
+    def click(x_m: float, y_m: float) -> None:
+        box = ada.page.get_by_role("img", name="The table now, from above").bounding_box()
+        # The robot looks up: x up, y to the left.
+        ada.page.mouse.click(box["x"] + (0.5 - y_m) * box["width"], box["y"] + (0.75 - x_m) / 0.5 * box["height"])
+
+    click(proposed.pick.x, proposed.pick.y)
+    expect(ada.page.get_by_text("Now click where to place it.")).to_be_visible()
+    click(proposed.place.x, proposed.place.y)
+    results = operator.count("step_result")
+    ada.button("Carry it out").click()
+    moved = operator.next("step_result", results)
+    assert moved.outcome == StepResult.PLACED, moved
+    ada.button("As it should be: keep this step").click()
+    expect(ada.page.get_by_text("Lesson, 1 step so far.")).to_be_visible()
+
+    # The step is taken back, and shown once more.
+    ada.button("Take the last step back").click()
+    ada.button("As it should be: keep this step").click()
+    expect(ada.page.get_by_text("Lesson, 0 steps so far.")).to_be_visible()
+    click(proposed.pick.x, proposed.pick.y)
+    click(proposed.place.x, proposed.place.y)
+    ada.button("Carry it out").click()
+    ada.button("As it should be: keep this step").click()
+    ada.page.get_by_label("Name of the task").fill("one_block")
+    ada.button("Save").click()
+    expect(ada.page.get_by_text("Saved as one_block.")).to_be_visible()
+    ada.button("End the lesson").click()
+
+    goals = operator.count("goal")
+    ada.button("Repeat one_block").click()
+    goal = operator.next("goal", goals)
+    assert (goal.problem, goal.step, goal.step_count) == ("one_block", 1, 1)
+    ada.reads("Step 1 of 1")
+    ada.close()
+
+
+def test_a_program_approves_a_step_and_is_refused_what_is_stale(start, decided) -> None:
+    _, address = launch_web(start, 10004)
+    console = CLIENT.Console(address, "a program")
+    with pytest.raises(CLIENT.Refused, match="Nobody decides"):
+        console.decide("approve", {"id": "1"})
+    console.take_control()
+    first = console.wait("proposed")
+    rows, cols, colors, heights_m = console.heightmap("present")
+    assert (rows, cols, len(colors), len(heights_m)) == (320, 160, 3 * 320 * 160, 320 * 160)
+    assert 0.01 < max(heights_m) < 0.3
+    until(lambda: "approve" not in console.state()["refused"], "fresh streams", 30.0)
+    console.decide("reject", first["proposal"])
+    second = until(
+        lambda: (state := console.state())["phase"] == "proposed" and state["proposal"]["id"] != first["proposal"]["id"] and state,
+        "proposal",
+        60.0,
+    )
+    with pytest.raises(CLIENT.Refused, match="is not the present one"):
+        console.decide("approve", first["proposal"])
+    console.decide("approve", second["proposal"])
+    # Replayed: nothing happens twice.
+    with pytest.raises(CLIENT.Refused):
+        console.decide("approve", second["proposal"])
+    state = console.wait("awaiting_confirmation")
+    assert state["steps"][-1]["proposal"]["id"] == second["proposal"]["id"]
+    said = [one.decision for one in decided()]
+    assert said == [StepConfirmation.REJECT, StepConfirmation.APPROVE]
+
+
+def test_hostile_input_moves_nothing_and_the_page_works_on(start, decided) -> None:
+    _, address = launch_web(start, 10006)
+    console = CLIENT.Console(address, "Ada")
+    console.take_control()
+    console.wait("proposed")
+    url = urllib.parse.urlsplit(address)
+    generator = random.Random(7)
+    token = url.fragment.removeprefix("token=")
+
+    def send(data: bytes) -> bytes:
+        with socket.create_connection((url.hostname, url.port), timeout=5) as connection:
+            try:
+                connection.sendall(data)
+                connection.shutdown(socket.SHUT_WR)
+                return connection.recv(65536)
+            except OSError:
+                # It was cut off.
+                return b""
+
+    host = f"Host: {url.netloc}\r\n".encode()
+    for _ in range(200):
+        garbage = generator.randbytes(generator.randrange(1, 400))
+        kind = generator.randrange(3)
+        if kind == 0:
+            send(garbage)
+        elif kind == 1:
+            answer = send(b"POST /api/v1/decisions HTTP/1.1\r\n" + host + b"Content-Length: %d\r\n\r\n" % len(garbage) + garbage)
+            assert not answer.startswith(b"HTTP/1.1 2"), answer
+        else:
+            upgrade = b"GET /api/v1/live HTTP/1.1\r\n" + host + b"Connection: Upgrade\r\nUpgrade: websocket\r\n"
+            upgrade += b"Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n\r\n"
+            assert b'"phase"' not in send(upgrade + garbage)
+    # A message of 100 MB is refused before it is read.
+    head = b"POST /api/v1/decisions HTTP/1.1\r\n" + host + b"Authorization: Bearer " + token.encode()
+    answer = send(head + b"\r\nContent-Type: application/json\r\nContent-Length: 100000000\r\n\r\n" + bytes(1 << 20))
+    assert b" 4" in answer[:13] or answer == b"", answer
+    with pytest.raises(CLIENT.Refused) as wrong:
+        CLIENT.Console(address.replace(token, "0" * len(token)), "Eve")
+    assert wrong.value.status == 401
+
+    assert decided() == []
+    assert json.dumps(console.state()).count(token) == 0
+    proposal = console.wait("proposed")["proposal"]
+    until(lambda: "approve" not in console.state()["refused"], "fresh streams", 30.0)
+    console.decide("approve", proposal)
+    console.wait("awaiting_confirmation")

@@ -81,6 +81,13 @@ class Cameras:
             )
         )
 
+    def publish_view(self, name: str, view: View) -> None:
+        """Publishes a view of one camera as it is."""
+        colour, depth, info = self._publishers[name]
+        info.publish(view.info)
+        colour.publish(view.colour)
+        depth.publish(view.depth)
+
     def publish(self, change: Change = lambda _: None, changed: str | None = "left", leave_out: str | None = None) -> Time:
         """Publishes one view of each camera and returns their stamp. `change` alters the view of the camera `changed`, or of all."""
         self._seconds += 1

@@ -9,9 +9,14 @@ from __future__ import annotations
 import json
 import os
 import subprocess
+import sys
+import time
 
+import pytest
+from cameras import NAMES
+from cell_operator import Operator
 from heightmap_latency import measure
-from processes import BINARIES, REPOSITORY
+from processes import BINARIES, REPOSITORY, environment, free_domain
 
 STRICT = os.environ.get("SCTN_FIGURES") == "1"
 
@@ -23,6 +28,48 @@ def test_heightmaps_reach_rclpy_whole_and_soon() -> None:
     assert figures["lost"] == 0
     if STRICT:
         assert figures["max_s"] < 0.05
+
+
+@pytest.mark.parametrize("profile", [True, False], ids=["with the profile", "without it"])
+def test_cameras_on_fast_dds_lose_no_image(start, profile: bool) -> None:
+    """Three RGB-D cameras written with rclpy, a process each, with images of 0.9 and 1.2 MB at one moment; Fast DDS sends them in bursts."""
+    rate_hz, seconds = 10, 4
+    sets = rate_hz * seconds + 1
+    domain = free_domain()
+    start("camera_fusion", domain=domain)
+    own = {**environment(domain), "RMW_IMPLEMENTATION": "rmw_fastrtps_cpp"}
+    own.pop("FASTRTPS_DEFAULT_PROFILES_FILE", None)
+    if profile:
+        own["FASTRTPS_DEFAULT_PROFILES_FILE"] = str(REPOSITORY / "config/fastdds.xml")
+    # All begin at the same moment, when each has found the fusion.
+    begin_s = int(time.time()) + 15
+    program = [sys.executable, "tests/camera_process.py"]
+    arguments = [str(value) for value in (begin_s, rate_hz, seconds)]
+    cameras = [subprocess.Popen([*program, name, *arguments], cwd=REPOSITORY, env=own) for name in NAMES]
+    topics = [f"/{name}/{stream}" for name in NAMES for stream in ("color/image_raw", "depth/image_rect_raw")]
+    try:
+        with Operator(domain) as operator:
+
+            def counts() -> dict[str, dict[str, int]]:
+                said = operator.diagnosed("camera_fusion: topics")
+                words = {topic: said.get(topic, "").split() for topic in [*topics, "/heightmap"]}
+                return {topic: {k: int(v) for k, _, v in (word.partition("=") for word in all_) if v.isdigit()} for topic, all_ in words.items()}
+
+            def all_have_come() -> bool:
+                return all(count.get("messages", 0) >= sets for count in counts().values())
+
+            # The last of the cameras sends until this time; what is lost by then is asked for again.
+            end_s = begin_s + seconds + 20
+            while time.time() < end_s and not all_have_come():
+                operator.spin(0.5)
+            found = counts()
+        assert all(camera.wait(60) == 0 for camera in cameras)
+    finally:
+        for camera in cameras:
+            if camera.poll() is None:
+                camera.kill()
+    lost = {topic: count for topic, count in found.items() if count.get("messages") != sets or count.get("dropped") != 0}
+    assert not lost, f"of {sets} sets: {lost}"
 
 
 def test_the_streams_of_three_cameras_become_heightmaps() -> None:

@@ -1,6 +1,6 @@
 //! Reading bags.
 
-use crate::metadata::{Metadata, MetadataFile};
+use crate::metadata::{Metadata, MetadataFile, Profiles, TopicMetadata};
 use crate::packing::{Packing, Unpacked, unpack};
 use crate::qos::{self, Profile};
 use crate::scan::{self, Event, MAX_RECORD_BYTES, Records, Scan};
@@ -57,6 +57,27 @@ pub struct RawMessage {
     pub publish_time: Duration,
     /// CDR with header.
     pub data: Vec<u8>,
+}
+
+impl Topic {
+    /// A topic as `metadata.yaml` lists it.
+    fn listed(topic: TopicMetadata) -> Self {
+        let profiles = match topic.offered_qos_profiles {
+            Profiles::List(profiles) => profiles,
+            Profiles::Text(text) => qos::from_yaml(&text),
+        };
+        Self {
+            name: topic.name,
+            type_name: topic.type_name,
+            definition: Vec::new(),
+            definition_encoding: String::new(),
+            message_encoding: topic.serialization_format,
+            type_hash: topic.type_description_hash,
+            offered: profiles.iter().map(Into::into).collect(),
+            profiles,
+            message_count: 0,
+        }
+    }
 }
 
 impl RawMessage {
@@ -118,11 +139,15 @@ pub struct BagReader {
 impl BagReader {
     /// Opens a folder with `metadata.yaml`, or a single MCAP or SQLite file.
     pub fn open(path: &Path) -> Result<Self, BagError> {
-        let (paths, notes, packing) = if path.is_dir() {
-            let listing = read_metadata(path)?;
-            (listing.paths, listing.notes, listing.packing)
+        let Listing {
+            paths,
+            notes,
+            packing,
+            topics: listed,
+        } = if path.is_dir() {
+            read_metadata(path)?
         } else {
-            (vec![path.to_owned()], BTreeMap::new(), Packing::Undeclared)
+            Listing::of_file(path)
         };
         let mut unpacked = Vec::new();
         let mut files = Vec::new();
@@ -134,6 +159,12 @@ impl BagReader {
             topics
                 .entry(&topic.name)
                 .and_modify(|known| known.message_count += topic.message_count)
+                .or_insert_with(|| Topic::clone(topic));
+        }
+        // A topic that stayed silent may stand in metadata.yaml alone.
+        for topic in &listed {
+            topics
+                .entry(&topic.name)
                 .or_insert_with(|| Topic::clone(topic));
         }
         let topics = topics.into_values().collect();
@@ -302,6 +333,20 @@ struct Listing {
     paths: Vec<PathBuf>,
     notes: BTreeMap<String, String>,
     packing: Packing,
+    /// Its topics, without messages and definitions, which are in the files.
+    topics: Vec<Topic>,
+}
+
+impl Listing {
+    /// Of a file without a `metadata.yaml`.
+    fn of_file(path: &Path) -> Self {
+        Self {
+            paths: vec![path.to_owned()],
+            notes: BTreeMap::new(),
+            packing: Packing::Undeclared,
+            topics: Vec::new(),
+        }
+    }
 }
 
 /// `metadata.yaml` of a bag.
@@ -334,7 +379,8 @@ fn read_metadata(folder: &Path) -> Result<Listing, BagError> {
         reason,
     };
     let information = parse_metadata(folder)?;
-    if !["mcap", "sqlite3"].contains(&information.storage_identifier.as_str()) {
+    // Tools that rebuild metadata.yaml leave it empty; each file is read by its kind in any case.
+    if !["mcap", "sqlite3", ""].contains(&information.storage_identifier.as_str()) {
         return Err(not_a_bag(format!(
             "its storage is {:?}, expected \"mcap\" or \"sqlite3\"",
             information.storage_identifier
@@ -374,6 +420,11 @@ fn read_metadata(folder: &Path) -> Result<Listing, BagError> {
         paths,
         notes: information.custom_data.unwrap_or_default(),
         packing,
+        topics: information
+            .topics_with_message_count
+            .into_iter()
+            .map(|listed| Topic::listed(listed.topic_metadata))
+            .collect(),
     })
 }
 

@@ -118,6 +118,8 @@ pub struct Verification {
     pub topics: Vec<VerifiedTopic>,
     /// What is wrong.
     pub findings: Findings,
+    /// What is odd and takes nothing away from the bag.
+    pub remarks: Vec<String>,
 }
 
 /// What [`recover`] saved.
@@ -327,8 +329,21 @@ pub fn verify(path: &Path) -> Result<Verification, BagError> {
             .len();
         files.push(file);
     }
+    let mut remarks = Vec::new();
     if let Some(metadata) = &found.metadata {
         compare_metadata(metadata, &files, &topics, &mut findings);
+        if metadata.storage_identifier.is_empty() {
+            remarks.push(
+                "metadata.yaml: storage_identifier is \"\", expected \"mcap\" or \"sqlite3\"; the files are read by their kind"
+                    .to_owned(),
+            );
+        }
+        for listed in &metadata.topics_with_message_count {
+            topics.declare(
+                &listed.topic_metadata.name,
+                &listed.topic_metadata.type_name,
+            );
+        }
     }
     Ok(Verification {
         path: path.to_owned(),
@@ -336,6 +351,7 @@ pub fn verify(path: &Path) -> Result<Verification, BagError> {
         files,
         topics: topics.by_name.into_iter().map(Progress::finish).collect(),
         findings,
+        remarks,
     })
 }
 
@@ -380,6 +396,17 @@ impl Topics {
         Self {
             packing,
             by_name: BTreeMap::new(),
+        }
+    }
+
+    /// Takes note of a topic, which may stay without messages.
+    fn declare(&mut self, name: &str, type_name: &str) {
+        if !self.by_name.contains_key(name) {
+            let progress = Progress {
+                type_name: type_name.to_owned(),
+                ..Progress::default()
+            };
+            self.by_name.insert(name.to_owned(), progress);
         }
     }
 
@@ -440,6 +467,9 @@ fn verify_sqlite(
     };
     let mut read = || -> Result<(), BagError> {
         let file = SqliteFile::open(path.to_owned())?;
+        for topic in file.topics.values() {
+            topics.declare(&topic.name, &topic.type_name);
+        }
         for line in file.integrity()? {
             findings.add(&name, None, line);
         }
@@ -644,6 +674,9 @@ fn verify_mcap(
     if let Ok(summary) = &summary {
         compare_summary(&name, summary, &tally, findings);
     }
+    channels.channels.values().for_each(|topic| {
+        topics.declare(&topic.name, &topic.type_name);
+    });
     Ok(verified)
 }
 

@@ -134,6 +134,91 @@ fn a_topic_and_a_span_of_time_are_found_without_the_rest() {
     assert_eq!(last("/other", 2355), None);
 }
 
+/// A copy of a bag of tests/data, its `metadata.yaml` altered.
+fn altered_copy(name: &str, alter: impl Fn(String) -> String) -> (TempDir, PathBuf) {
+    let (folder, copy) = folder();
+    let data = Path::new(env!("CARGO_MANIFEST_DIR")).join("tests/data");
+    std::fs::create_dir(&copy).unwrap();
+    for file in std::fs::read_dir(data.join(name)).unwrap() {
+        let file = file.unwrap();
+        std::fs::copy(file.path(), copy.join(file.file_name())).unwrap();
+    }
+    let metadata = copy.join("metadata.yaml");
+    let text = alter(std::fs::read_to_string(&metadata).unwrap());
+    std::fs::write(&metadata, text).unwrap();
+    (folder, copy)
+}
+
+#[test]
+fn an_empty_storage_identifier_is_read_by_the_kind_of_the_files_and_remarked() {
+    for (name, said, storage) in [
+        ("rosbags_sqlite", "storage_identifier: sqlite3", "sqlite3"),
+        ("rosbags_plain", "storage_identifier: mcap", "mcap"),
+    ] {
+        let empty = |text: String| {
+            assert!(text.contains(said));
+            text.replace(said, "storage_identifier: \"\"")
+        };
+        let (_folder, bag) = altered_copy(name, empty);
+        let info = bags::BagInfo::read(&bag).unwrap();
+        assert_eq!((info.messages, info.files[0].storage), (6, storage));
+        let verification = bags::verify(&bag).unwrap();
+        assert!(verification.whole, "{:?}", verification.findings);
+        assert_eq!(verification.remarks.len(), 1);
+        assert!(verification.remarks[0].contains("storage_identifier"));
+        let (_folder, other) =
+            altered_copy(name, |text| text.replace(said, "storage_identifier: tar"));
+        let refusal = bags::BagInfo::read(&other).unwrap_err().to_string();
+        assert!(refusal.contains("\"tar\""), "{refusal}");
+    }
+}
+
+#[test]
+fn a_topic_without_messages_is_listed_with_none() {
+    // In metadata.yaml alone, as where nothing was ever published.
+    let silent = "  topics_with_message_count:\n  - topic_metadata:\n      name: /silent\n      \
+        type: std_msgs/msg/String\n      serialization_format: cdr\n      offered_qos_profiles: []\n      \
+        type_description_hash: ''\n    message_count: 0\n";
+    for name in ["rosbags_sqlite", "rosbags_plain"] {
+        let (_folder, bag) = altered_copy(name, |text| {
+            let key = "  topics_with_message_count:\n";
+            assert!(text.contains(key), "{text}");
+            text.replace(key, silent)
+        });
+        is_listed_with_none(&bag, "/silent");
+    }
+    // In the database too, as rosbag2 writes it.
+    let (_folder, bag) = altered_copy("rosbags_sqlite", |text| text);
+    let database = rusqlite::Connection::open(bag.join("rosbags_sqlite.db3")).unwrap();
+    database
+        .execute(
+            "INSERT INTO topics (id, name, type, serialization_format, offered_qos_profiles, type_description_hash) \
+             VALUES (77, '/silent', 'std_msgs/msg/String', 'cdr', '', '')",
+            [],
+        )
+        .unwrap();
+    drop(database);
+    is_listed_with_none(&bag, "/silent");
+}
+
+fn is_listed_with_none(bag: &Path, topic: &str) {
+    let info = bags::BagInfo::read(bag).unwrap();
+    let listed = info.topics.iter().find(|listed| listed.name == topic);
+    let listed = listed.unwrap_or_else(|| panic!("{topic} is not listed"));
+    assert_eq!(
+        (listed.messages, listed.type_name.as_str()),
+        (0, "std_msgs/msg/String")
+    );
+    let verification = bags::verify(bag).unwrap();
+    assert!(verification.whole, "{:?}", verification.findings);
+    let mut topics = verification.topics.iter();
+    let verified = topics.find(|verified| verified.name == topic).unwrap();
+    assert_eq!(
+        (verified.messages, verified.type_name.as_str()),
+        (0, "std_msgs/msg/String")
+    );
+}
+
 #[test]
 fn bags_of_another_program_are_read() {
     for name in [

@@ -214,6 +214,9 @@ impl Verify {
                 );
             }
             show(&verification.findings);
+            for remark in &verification.remarks {
+                println!("  {remark}");
+            }
             println!(
                 "{}",
                 if verification.whole {

@@ -68,14 +68,14 @@ pub struct Fusion {
 
 /// Rays of the pixels of a camera, without distortion.
 #[derive(Debug)]
-struct LensRays {
-    of: Intrinsics,
+pub(crate) struct LensRays {
+    pub(crate) of: Intrinsics,
     /// x and y where z is 1, row-major; not a number where the lens shows nothing.
-    rays: Vec<[f32; 2]>,
+    pub(crate) rays: Vec<[f32; 2]>,
 }
 
 impl LensRays {
-    fn new(of: Intrinsics) -> Self {
+    pub(crate) fn new(of: Intrinsics) -> Self {
         let ray = |index: usize| {
             let image = Point2::new((index % of.width) as f64, (index / of.width) as f64);
             let ray = of.ray(&image);
@@ -354,13 +354,13 @@ fn mean(sums: [u32; 3], views: u32) -> [u8; 3] {
 }
 
 /// Bits of a float in the order of its value; never 0 for a finite one.
-fn ordered(value: f32) -> u32 {
+pub(crate) fn ordered(value: f32) -> u32 {
     let bits = value.to_bits();
     bits ^ (((bits as i32 >> 31) as u32) | 0x8000_0000)
 }
 
 /// The float of [`ordered`] bits.
-fn from_ordered(bits: u32) -> f32 {
+pub(crate) fn from_ordered(bits: u32) -> f32 {
     let flip = if bits & 0x8000_0000 == 0 {
         u32::MAX
     } else {
@@ -370,7 +370,7 @@ fn from_ordered(bits: u32) -> f32 {
 }
 
 impl View<'_> {
-    fn check(&self) -> Result<(), FusionError> {
+    pub(crate) fn check(&self) -> Result<(), FusionError> {
         self.camera.check()?;
         let Intrinsics { width, height, .. } = self.camera.intrinsics;
         let pixels = width * height;

@@ -5,14 +5,20 @@
 //! (0, 0) lies at the corner of the smallest x and y.
 
 mod camera;
+mod change;
 mod distortion;
 mod fusion;
 pub mod picture;
+mod registration;
+mod still;
 mod workspace;
 
 pub use camera::{Camera, CameraError, Intrinsics};
+pub use change::{BlobRule, Change, ChangeRules, OtherWorkspace, largest_change};
 pub use distortion::Distortion;
 pub use fusion::{Fusion, FusionError, FusionReport, View};
+pub use registration::{has_shape_of, register_depth, scale_depth};
+pub use still::{StillFusion, StillSettings};
 pub use workspace::{Disk, Heightmap, HeightmapError, Pixel, Workspace, WorkspaceError};
 
 /// The examples of the README are run as tests.

@@ -164,6 +164,11 @@ impl Heightmap {
         self.height_m[pixel.row * self.workspace.cols + pixel.col]
     }
 
+    /// Whether a cell (row-major index) was seen: one that was not is black at height 0.
+    pub fn is_seen(&self, index: usize) -> bool {
+        self.height_m[index] != 0.0 || self.rgb[3 * index..3 * index + 3] != [0; 3]
+    }
+
     /// Share of cells whose height differs by more than `tolerance_m`: how much the scene changed. All
     /// of it if the heightmaps cover different workspaces.
     pub fn changed_fraction(&self, other: &Self, tolerance_m: f32) -> f64 {

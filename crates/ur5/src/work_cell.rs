@@ -21,6 +21,9 @@ pub struct WorkCell {
     pub collisions: Vec<Body>,
     /// Where each link but the root hangs, in the order of the URDF.
     pub frames: Vec<Frame>,
+    /// Links with shapes that are no primitives (meshes, capsules), in the order of the URDF, each once. Those shapes are
+    /// neither in `visuals` nor in `collisions`.
+    pub skipped: Vec<String>,
     /// The URDF itself, for who draws the cell.
     pub urdf: String,
 }
@@ -171,8 +174,9 @@ impl WorkCell {
 
     /// Reads the text of a URDF. It must hold a chain of six revolute joints with a UR arm's
     /// geometry up to a link `suction_tip`, by way of a link `tool0`; links named
-    /// `NAME_camera_optical_frame` are cameras; everything else is fixed. `path` names it in
-    /// errors.
+    /// `NAME_camera_optical_frame` are cameras; everything else is fixed. Shapes that are no
+    /// primitives are left out and their links named in [`Self::skipped`]; a shape without a
+    /// colour is grey. `path` names the text in errors.
     ///
     /// # Errors
     /// Says what is missing or wrong.
@@ -198,6 +202,7 @@ impl WorkCell {
             visuals: Vec::new(),
             collisions: Vec::new(),
             frames: Vec::new(),
+            skipped: Vec::new(),
             urdf: text.to_owned(),
         };
         for joint in &robot.joints {
@@ -226,28 +231,49 @@ impl WorkCell {
                 cell.cameras.push((name.into(), link_pose));
             }
             let body = |geometry, origin, rgb| {
-                Ok::<_, String>(Body {
+                let pose = link_pose * read_pose(origin, &link.name)?;
+                let shape = read_shape(geometry, &link.name)?;
+                Ok::<_, String>(shape.map(|shape| Body {
                     link: link.name.clone(),
-                    shape: read_shape(geometry, &link.name)?,
+                    shape,
                     rgb,
                     moving_link,
-                    pose: link_pose * read_pose(origin, &link.name)?,
-                })
+                    pose,
+                }))
             };
+            let mut skipped = false;
             for visual in &link.visual {
                 let rgb = read_color(visual.material.as_ref(), &colors, &link.name)?;
-                cell.visuals
-                    .push(body(&visual.geometry, &visual.origin, rgb)?);
+                match body(&visual.geometry, &visual.origin, rgb)? {
+                    Some(body) => cell.visuals.push(body),
+                    None => skipped = true,
+                }
             }
             for collision in &link.collision {
-                cell.collisions
-                    .push(body(&collision.geometry, &collision.origin, [0; 3])?);
+                match body(&collision.geometry, &collision.origin, [0; 3])? {
+                    Some(body) => cell.collisions.push(body),
+                    None => skipped = true,
+                }
+            }
+            if skipped {
+                cell.skipped.push(link.name.clone());
             }
         }
         if cell.cameras.is_empty() {
             return Err("no link NAME_camera_optical_frame, expected at least one camera".into());
         }
         Ok(cell)
+    }
+
+    /// What a program that loads the cell should tell its user: which links have shapes that are left out. None when all shapes are used.
+    pub fn warning(&self) -> Option<String> {
+        (!self.skipped.is_empty()).then(|| {
+            format!(
+                "meshes and capsules of the links {} are left out, expected box, cylinder or sphere; they are neither drawn nor \
+                 taken for obstacles",
+                self.skipped.join(", ")
+            )
+        })
     }
 
     /// Name of the link that all others hang on.
@@ -500,7 +526,8 @@ fn read_pose(pose: &urdf_rs::Pose, place: &str) -> Result<Isometry3<f64>, String
     ))
 }
 
-fn read_shape(geometry: &Geometry, link: &str) -> Result<Shape, String> {
+/// None for a shape that is no primitive.
+fn read_shape(geometry: &Geometry, link: &str) -> Result<Option<Shape>, String> {
     let shape = match *geometry {
         Geometry::Box { size } => Shape::Cuboid {
             size_m: Vector3::from(size.0),
@@ -510,11 +537,7 @@ fn read_shape(geometry: &Geometry, link: &str) -> Result<Shape, String> {
             length_m: length,
         },
         Geometry::Sphere { radius } => Shape::Sphere { radius_m: radius },
-        Geometry::Capsule { .. } | Geometry::Mesh { .. } => {
-            return Err(format!(
-                "a shape of link {link} is a capsule or mesh, expected box, cylinder or sphere"
-            ));
-        }
+        Geometry::Capsule { .. } | Geometry::Mesh { .. } => return Ok(None),
     };
     let lengths = match shape {
         Shape::Cuboid { size_m } => [size_m.x, size_m.y, size_m.z],
@@ -529,20 +552,24 @@ fn read_shape(geometry: &Geometry, link: &str) -> Result<Shape, String> {
             "a shape of link {link} has a length that is not positive and finite"
         ));
     }
-    Ok(shape)
+    Ok(Some(shape))
 }
+
+/// Of shapes whose colour the URDF does not say.
+const GREY: [u8; 3] = [128; 3];
 
 fn read_color(
     material: Option<&urdf_rs::Material>,
     named: &BTreeMap<&str, [f64; 4]>,
     link: &str,
 ) -> Result<[u8; 3], String> {
-    let material = material.ok_or_else(|| format!("a shape of link {link} has no material"))?;
-    let rgba = match &material.color {
-        Some(color) => color.rgba.0,
-        None => *named
-            .get(material.name.as_str())
-            .ok_or_else(|| format!("material {:?} of link {link} has no colour", material.name))?,
+    let Some(material) = material else {
+        return Ok(GREY);
+    };
+    let rgba = match (&material.color, named.get(material.name.as_str())) {
+        (Some(color), _) => color.rgba.0,
+        (None, Some(rgba)) => *rgba,
+        (None, None) => return Ok(GREY),
     };
     if !rgba.iter().all(|value| (0.0..=1.0).contains(value)) {
         return Err(format!(

@@ -343,16 +343,6 @@ fn what_is_wrong_with_a_urdf_is_named() {
             "<cylinder radius=\"-0.01\"",
             "suction_gripper",
         ),
-        (
-            "<box size=\"1.8 1.8 0.05\"/>",
-            "<mesh filename=\"table.stl\"/>",
-            "table",
-        ),
-        (
-            "<material name=\"rubber\"><color",
-            "<material name=\"gum\"><color",
-            "rubber",
-        ),
         ("0.12 0.12 0.12 1", "12 12 12 1", "0..1"),
         (
             "<link name=\"flange\"/>",
@@ -373,6 +363,43 @@ fn what_is_wrong_with_a_urdf_is_named() {
         .unwrap_err()
         .to_string();
     assert!(error.starts_with("no/such.urdf: "), "{error}");
+}
+
+#[test]
+fn meshes_are_left_out_with_one_warning_and_a_missing_colour_is_grey() {
+    let text = std::fs::read_to_string(URDF).unwrap();
+    let plain = cell();
+    assert_eq!((plain.skipped.len(), plain.warning()), (0, None));
+    // As published descriptions of arms have it: a mesh for the eye, one for collisions, no material.
+    let mesh = "<geometry><mesh filename=\"package://arm/meshes/extra.dae\" scale=\"0.001 0.001 0.001\"/></geometry>";
+    let extra = format!(
+        "<link name=\"extra\"><visual>{mesh}</visual><collision>{mesh}</collision></link>\
+         <link name=\"bare\"><visual><geometry><sphere radius=\"0.02\"/></geometry></visual></link>\
+         <joint name=\"to_extra\" type=\"fixed\"><parent link=\"world\"/><child link=\"extra\"/></joint>\
+         <joint name=\"to_bare\" type=\"fixed\"><parent link=\"world\"/><child link=\"bare\"/></joint></robot>"
+    );
+    let with = WorkCell::parse(&text.replace("</robot>", &extra), "cell.urdf").unwrap();
+    assert_eq!(with.skipped, ["extra"]);
+    let warning = with.warning().unwrap();
+    assert!(
+        warning.contains("extra") && warning.contains("box"),
+        "{warning}"
+    );
+    let bare: Vec<_> = with
+        .visuals
+        .iter()
+        .filter(|body| body.link == "bare")
+        .collect();
+    assert_eq!((bare.len(), bare[0].rgb), (1, [128; 3]));
+    assert_eq!(with.visuals.len(), plain.visuals.len() + 1);
+    assert_eq!(with.collisions.len(), plain.collisions.len());
+    // A material that is named and never described.
+    let gum = text.replace(
+        "<material name=\"rubber\"><color",
+        "<material name=\"gum\"><color",
+    );
+    let gum = WorkCell::parse(&gum, "cell.urdf").unwrap();
+    assert!(gum.visuals.iter().any(|body| body.rgb == [128; 3]));
 }
 
 #[test]

@@ -9,7 +9,7 @@ use serde_bytes::ByteBuf;
 /// Rows of an image without their padding, once the sizes are right.
 fn rows<'a>(
     image: &'a sensor_msgs::Image,
-    expected: &Intrinsics,
+    (width, height): (usize, usize),
     pixel_bytes: usize,
 ) -> Result<impl Iterator<Item = &'a [u8]>, ConvertError> {
     let same = |field, actual: u32, expected: usize| {
@@ -19,19 +19,19 @@ fn rows<'a>(
             Err(unexpected(field, actual, format!("{expected}")))
         }
     };
-    same("width", image.width, expected.width)?;
-    same("height", image.height, expected.height)?;
-    let row_bytes = expected.width * pixel_bytes;
+    same("width", image.width, width)?;
+    same("height", image.height, height)?;
+    let row_bytes = width * pixel_bytes;
     let step = image.step as usize;
     if step < row_bytes || row_bytes == 0 {
         return Err(unexpected(
             "step",
             step,
-            format!("at least {row_bytes} for {} pixels", expected.width),
+            format!("at least {row_bytes} for {width} pixels"),
         ));
     }
     let bytes = step
-        .checked_mul(expected.height)
+        .checked_mul(height)
         .ok_or_else(|| unexpected("step", step, "a sane size"))?;
     size("data", image.data.len(), bytes)?;
     Ok(image
@@ -48,9 +48,10 @@ pub fn color_from_msg(
     rgb: &mut Vec<u8>,
 ) -> Result<(), ConvertError> {
     rgb.clear();
+    let size_px = (expected.width, expected.height);
     match image.encoding.as_str() {
-        "rgb8" => rows(image, expected, 3)?.for_each(|row| rgb.extend_from_slice(row)),
-        "bgr8" => rows(image, expected, 3)?.for_each(|row| {
+        "rgb8" => rows(image, size_px, 3)?.for_each(|row| rgb.extend_from_slice(row)),
+        "bgr8" => rows(image, size_px, 3)?.for_each(|row| {
             rgb.extend(
                 row.as_chunks::<3>()
                     .0
@@ -58,7 +59,7 @@ pub fn color_from_msg(
                     .flat_map(|&[b, g, r]| [r, g, b]),
             )
         }),
-        "rgba8" => rows(image, expected, 4)?.for_each(|row| {
+        "rgba8" => rows(image, size_px, 4)?.for_each(|row| {
             rgb.extend(
                 row.as_chunks::<4>()
                     .0
@@ -66,7 +67,7 @@ pub fn color_from_msg(
                     .flat_map(|&[r, g, b, _]| [r, g, b]),
             )
         }),
-        "bgra8" => rows(image, expected, 4)?.for_each(|row| {
+        "bgra8" => rows(image, size_px, 4)?.for_each(|row| {
             rgb.extend(
                 row.as_chunks::<4>()
                     .0
@@ -74,7 +75,7 @@ pub fn color_from_msg(
                     .flat_map(|&[b, g, r, _]| [r, g, b]),
             )
         }),
-        "mono8" => rows(image, expected, 1)?
+        "mono8" => rows(image, size_px, 1)?
             .for_each(|row| rgb.extend(row.iter().flat_map(|&grey| [grey; 3]))),
         other => {
             return Err(unexpected(
@@ -87,29 +88,30 @@ pub fn color_from_msg(
     Ok(())
 }
 
-/// Depth in metres of an image of encoding 16UC1 (millimetres) or 32FC1 (metres), row-major, without padding.
-/// Its size must be that of `expected`. 0 and values that are not finite stand for "nothing measured" (REP-118), and
+/// Depth in metres of an image of encoding 16UC1 or mono16 (millimetres) or 32FC1 (metres), row-major, without padding, of
+/// the image's own size, which is `width` times `height` of the message. 0 and values that are not finite stand for "nothing measured" (REP-118), and
 /// so do negative ones: one odd pixel is no reason to lose a view. `depth_m` is overwritten.
 pub fn depth_from_msg(
     image: &sensor_msgs::Image,
-    expected: &Intrinsics,
     depth_m: &mut Vec<f32>,
 ) -> Result<(), ConvertError> {
     depth_m.clear();
+    let own = (image.width as usize, image.height as usize);
     let big_endian = match image.is_bigendian {
         0 => false,
         1 => true,
         other => return Err(unexpected("is_bigendian", other, "0 or 1")),
     };
     match image.encoding.as_str() {
-        "16UC1" => {
+        // Older drivers say mono16, in millimetres too.
+        "16UC1" | "mono16" => {
             let meters = |bytes: [u8; 2], read: fn([u8; 2]) -> u16| f32::from(read(bytes)) / 1000.0;
             let read = if big_endian {
                 u16::from_be_bytes
             } else {
                 u16::from_le_bytes
             };
-            rows(image, expected, 2)?.for_each(|row| {
+            rows(image, own, 2)?.for_each(|row| {
                 depth_m.extend(
                     row.as_chunks::<2>()
                         .0
@@ -124,7 +126,7 @@ pub fn depth_from_msg(
             } else {
                 f32::from_le_bytes
             };
-            rows(image, expected, 4)?.for_each(|row| {
+            rows(image, own, 4)?.for_each(|row| {
                 depth_m.extend(row.as_chunks::<4>().0.iter().map(|&bytes| read(bytes)))
             });
         }
@@ -132,7 +134,7 @@ pub fn depth_from_msg(
             return Err(unexpected(
                 "encoding",
                 format!("{other:?}"),
-                "16UC1 or 32FC1",
+                "16UC1, mono16 or 32FC1",
             ));
         }
     }
@@ -215,31 +217,53 @@ pub fn depth_to_msg_mm(
     )
 }
 
-/// Lens distortion of a calibration: model plumb_bob, or none.
+/// Lens models of drivers that project like a pinhole where all coefficients are 0; librealsense's names besides ROS's own. A fisheye
+/// model (`equidistant`) is no pinhole even then.
+const PINHOLE_MODELS: [&str; 8] = [
+    "",
+    "none",
+    "plumb_bob",
+    "rational_polynomial",
+    "thin_prism",
+    "brown_conrady",
+    "inverse_brown_conrady",
+    "modified_brown_conrady",
+];
+
+/// Lens distortion of a calibration: model plumb_bob, under any of its names, or none.
 fn distortion_from_msg(info: &sensor_msgs::CameraInfo) -> Result<Distortion, ConvertError> {
     all_finite("d", &info.d)?;
+    // librealsense writes "Inverse Brown Conrady".
+    let model = info
+        .distortion_model
+        .to_lowercase()
+        .replace([' ', '-'], "_");
+    let undistorted = info.d.iter().all(|coefficient| *coefficient == 0.0);
+    if undistorted && model != "plumb_bob" && PINHOLE_MODELS.contains(&model.as_str()) {
+        return Ok(Distortion::NONE);
+    }
     let too_many = |expected: &'static str| unexpected("d", format!("{:?}", info.d), expected);
-    match (info.distortion_model.as_str(), info.d.as_slice()) {
-        ("plumb_bob", []) => Ok(Distortion::NONE),
-        ("plumb_bob", &[k1, k2, p1, p2]) => Ok(Distortion {
+    match (model.as_str(), info.d.as_slice()) {
+        ("plumb_bob" | "brown_conrady", []) => Ok(Distortion::NONE),
+        ("plumb_bob" | "brown_conrady", &[k1, k2, p1, p2]) => Ok(Distortion {
             k1,
             k2,
             p1,
             p2,
             k3: 0.0,
         }),
-        ("plumb_bob", &[k1, k2, p1, p2, k3]) => Ok(Distortion { k1, k2, p1, p2, k3 }),
-        ("plumb_bob", _) => Err(too_many("k1, k2, p1, p2 and k3 of plumb_bob")),
-        // A driver that does not know, or has none to tell.
-        ("", d) if d.iter().all(|coefficient| *coefficient == 0.0) => Ok(Distortion::NONE),
+        ("plumb_bob" | "brown_conrady", &[k1, k2, p1, p2, k3]) => {
+            Ok(Distortion { k1, k2, p1, p2, k3 })
+        }
+        ("plumb_bob" | "brown_conrady", _) => Err(too_many("k1, k2, p1, p2 and k3 of plumb_bob")),
         // The polynomial in the denominator is 1.
         ("rational_polynomial", &[k1, k2, p1, p2, k3, k4, k5, k6]) if [k4, k5, k6] == [0.0; 3] => {
             Ok(Distortion { k1, k2, p1, p2, k3 })
         }
-        (other, _) => Err(unexpected(
+        _ => Err(unexpected(
             "distortion_model",
-            format!("{other:?} with d {:?}", info.d),
-            "\"plumb_bob\"",
+            format!("{:?} with d {:?}", info.distortion_model, info.d),
+            "\"plumb_bob\", or a pinhole model with d of zeros",
         )),
     }
 }
@@ -386,17 +410,17 @@ mod tests {
     fn depth_of_either_byte_order_is_in_metres() {
         let mut depth_m = vec![99.0];
         let little = padded("16UC1", 0, 5, &[232, 3, 0, 0, 9, 1, 0, 255, 255, 9]);
-        depth_from_msg(&little, &CAMERA, &mut depth_m).unwrap();
+        depth_from_msg(&little, &mut depth_m).unwrap();
         assert_eq!(depth_m, [1.0, 0.0, 0.001, 65.535]);
         let big = padded("16UC1", 1, 4, &[3, 232, 0, 0, 0, 1, 255, 255]);
-        depth_from_msg(&big, &CAMERA, &mut depth_m).unwrap();
+        depth_from_msg(&big, &mut depth_m).unwrap();
         assert_eq!(depth_m, [1.0, 0.0, 0.001, 65.535]);
         let values: [f32; 4] = [0.5, f32::NAN, f32::INFINITY, 0.0];
         let bytes: Vec<u8> = values
             .iter()
             .flat_map(|value| value.to_be_bytes())
             .collect();
-        depth_from_msg(&padded("32FC1", 1, 8, &bytes), &CAMERA, &mut depth_m).unwrap();
+        depth_from_msg(&padded("32FC1", 1, 8, &bytes), &mut depth_m).unwrap();
         assert_eq!(
             depth_m
                 .iter()
@@ -407,13 +431,38 @@ mod tests {
     }
 
     #[test]
+    fn mono16_depth_is_in_millimetres_like_16uc1() {
+        let mut depth_m = Vec::new();
+        let image = padded("mono16", 0, 4, &[232, 3, 0, 0, 1, 0, 255, 255]);
+        depth_from_msg(&image, &mut depth_m).unwrap();
+        assert_eq!(depth_m, [1.0, 0.0, 0.001, 65.535]);
+    }
+
+    #[test]
+    fn a_lens_model_of_any_driver_with_zero_coefficients_is_a_pinhole() {
+        for model in [
+            "inverse_brown_conrady",
+            "Inverse Brown Conrady",
+            "modified_brown_conrady",
+            "brown_conrady",
+            "rational_polynomial",
+            "None",
+            "plumb_bob",
+        ] {
+            let mut info = intrinsics_to_msg(Default::default(), &CAMERA);
+            info.distortion_model = model.into();
+            assert_eq!(intrinsics_from_msg(&info).unwrap(), CAMERA, "{model}");
+        }
+    }
+
+    #[test]
     fn images_of_our_own_are_read_back() {
         let depth_m = [0.25, 1.5, 0.0, 2.0];
         let mut read = Vec::new();
         for image in [depth_to_msg, depth_to_msg_mm]
             .map(|make| make(Default::default(), &CAMERA, &depth_m).unwrap())
         {
-            depth_from_msg(&image, &CAMERA, &mut read).unwrap();
+            depth_from_msg(&image, &mut read).unwrap();
             assert_eq!(read, depth_m);
         }
         let mut rgb = Vec::new();
@@ -501,8 +550,14 @@ mod tests {
         assert!(refusal(|info| info.d[1] = f64::NAN).starts_with("d[1] is not finite"));
         assert!(refusal(|info| info.d.push(0.1)).starts_with("d is"));
         assert!(refusal(|info| info.d.truncate(2)).starts_with("d is"));
-        for model in ["equidistant", "rational_polynomial", "fisheye"] {
+        for (model, k1) in [
+            ("equidistant", 0.0),
+            ("fisheye", 0.0),
+            ("rational_polynomial", 0.1),
+            ("inverse_brown_conrady", 0.1),
+        ] {
             let mut info = good.clone();
+            info.d[0] = k1;
             info.distortion_model = model.to_owned();
             let error = intrinsics_from_msg(&info).unwrap_err().to_string();
             assert!(

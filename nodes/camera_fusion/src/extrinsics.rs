@@ -50,7 +50,7 @@ pub struct Unconnected {
 }
 
 /// tf names had a leading slash once.
-fn plain(frame: &str) -> &str {
+pub(crate) fn plain(frame: &str) -> &str {
     frame.trim_start_matches('/')
 }
 
@@ -75,6 +75,26 @@ impl Transforms {
             }
         }
         errors
+    }
+
+    /// Pose of a frame in another one that hangs on the same root.
+    pub fn between(&self, to: &str, from: &str) -> Option<Isometry3<f64>> {
+        let (to_root, root_from_to) = self.up(to);
+        let (from_root, root_from_from) = self.up(from);
+        (to_root == from_root).then(|| root_from_to.inv_mul(&root_from_from))
+    }
+
+    /// The frame that no transform leads up from, at the end of a frame's chain, and the frame's pose in it.
+    fn up<'a>(&'a self, frame: &'a str) -> (&'a str, Isometry3<f64>) {
+        let (mut at, mut pose) = (plain(frame), Isometry3::identity());
+        for _ in 0..MAX_CHAIN {
+            let Some((parent, parent_from_at)) = self.parents.get(at) else {
+                break;
+            };
+            pose = parent_from_at * pose;
+            at = parent;
+        }
+        (at, pose)
     }
 
     /// Pose of a frame in the world.
@@ -202,6 +222,28 @@ mod tests {
         assert!(errors.is_empty());
         let pose = transforms.world_from("optical", "world").unwrap();
         assert!((pose.inv_mul(&(mast * camera))).translation.vector.norm() < 1e-12);
+    }
+
+    #[test]
+    fn frames_on_one_root_have_a_pose_in_each_other() {
+        let depth = Isometry3::new(vector![0.0, -0.015, 0.0], Vector3::z() * 0.01);
+        let color = Isometry3::new(vector![0.0, 0.015, 0.0], Vector3::x() * -0.02);
+        let mut transforms = Transforms::default();
+        transforms.update(TFMessage {
+            transforms: vec![
+                stamped("camera_link", "depth_optical", &depth),
+                stamped("camera_link", "color_optical", &color),
+                stamped("elsewhere", "other", &depth),
+            ],
+        });
+        let pose = transforms
+            .between("color_optical", "/depth_optical")
+            .unwrap();
+        assert!(
+            (pose.translation.vector - color.inv_mul(&depth).translation.vector).norm() < 1e-12
+        );
+        assert_eq!(transforms.between("color_optical", "other"), None);
+        assert_eq!(transforms.between("color_optical", "nowhere"), None);
     }
 
     #[test]

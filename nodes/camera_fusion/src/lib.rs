@@ -8,7 +8,7 @@ mod parameters;
 mod views;
 
 use std::{
-    collections::BTreeMap,
+    collections::{BTreeMap, VecDeque},
     path::Path,
     sync::Arc,
     time::{Duration, Instant},
@@ -19,7 +19,10 @@ use msgs::{
     sensor_msgs::{CameraInfo, Image},
     tf2_msgs::TFMessage,
 };
-use node_kit::{Active, Level, Node, NodeError, Publisher, Qos, Statistics};
+use node_kit::{
+    Active, Clock, ImageSubscription, Level, Node, NodeError, Publisher, Qos, Statistics,
+    ns_from_stamp,
+};
 use tokio::sync::mpsc;
 use tracing::{info, warn};
 
@@ -34,10 +37,13 @@ const WAITING_ARRIVALS: usize = 32;
 /// How often silent cameras are looked for.
 const LOOK_PERIOD: Duration = Duration::from_millis(250);
 
+/// How long transforms and calibrations may take to come after the first image without a word: the processes of a cell start one by one.
+const START_PATIENCE: Duration = Duration::from_secs(5);
+
 /// What a camera has sent.
 enum Arrival {
     Image(usize, Stream, Image),
-    Info(usize, Box<CameraInfo>),
+    Info(usize, Stream, Box<CameraInfo>),
 }
 
 /// Reads the calibration; what it returns fuses.
@@ -100,6 +106,7 @@ pub struct FusionNode {
     heightmap: Publisher<sctn_msgs::Heightmap>,
     outputs: Outputs,
     last_fusion: Duration,
+    clock: Clock,
     /// What the last heightmap was made from, by camera.
     used: Vec<Option<Used>>,
     last: Option<(Duration, u32, f32)>,
@@ -112,9 +119,55 @@ struct CameraTopics {
     color: Arc<Statistics>,
     depth: Arc<Statistics>,
     info: Arc<Statistics>,
+    depth_info: Arc<Statistics>,
+    /// What its images wait for, and since when.
+    pending: Option<Pending>,
+    skew: Skew,
     color_arrival: Option<Instant>,
     depth_arrival: Option<Instant>,
     silent: bool,
+}
+
+/// Something that is sent once and has not come yet.
+struct Pending {
+    since: Instant,
+    reason: String,
+    told: bool,
+}
+
+/// How far the stamps of a camera are from the time of their arrival.
+#[derive(Default)]
+struct Skew {
+    /// The last ones, later arrival positive [s].
+    recent_s: VecDeque<f64>,
+    told: bool,
+}
+
+/// Images whose skew is looked at together.
+const SKEW_WINDOW: usize = 15;
+
+impl Skew {
+    /// The median of the last images, once there are enough.
+    fn median_s(&self) -> Option<f64> {
+        let mut sorted: Vec<f64> = self.recent_s.iter().copied().collect();
+        sorted.sort_by(f64::total_cmp);
+        (sorted.len() == SKEW_WINDOW).then(|| sorted[SKEW_WINDOW / 2])
+    }
+
+    /// Takes one more image; the skew, when it is to be warned about.
+    fn add(&mut self, skew_s: f64, limit_s: f64) -> Option<f64> {
+        self.recent_s.push_back(skew_s);
+        if self.recent_s.len() > SKEW_WINDOW {
+            self.recent_s.pop_front();
+        }
+        let skewed = self.median_s().filter(|skew_s| skew_s.abs() > limit_s);
+        if skewed.is_none() && self.recent_s.len() == SKEW_WINDOW {
+            self.told = false;
+        }
+        let new = skewed.filter(|_| !self.told);
+        self.told |= new.is_some();
+        new
+    }
 }
 
 impl FusionNode {
@@ -131,6 +184,7 @@ impl FusionNode {
             heightmap: node.publisher("heightmap", Qos::Latched)?,
             outputs: Outputs::new(node)?,
             last_fusion: Duration::ZERO,
+            clock: node.clock().clone(),
             used: vec![None; parameters.cameras.len()],
             last: None,
             fused: 0,
@@ -158,7 +212,7 @@ impl FusionNode {
         let depth = format!("{camera}/depth/image_rect_raw");
         let mut images = Vec::new();
         for (topic, stream) in [(color, Stream::Color), (depth, Stream::Depth)] {
-            let mut subscription = node.subscription::<Image>(&topic, Qos::Image)?;
+            let mut subscription = ImageSubscription::<Image>::new(node, &topic)?;
             images.push(Arc::clone(subscription.statistics()));
             let arrivals = arrivals.clone();
             node.spawn(async move {
@@ -174,43 +228,66 @@ impl FusionNode {
                 }
             });
         }
-        let topic = format!("{camera}/color/camera_info");
-        let mut subscription = node.subscription::<CameraInfo>(&topic, Qos::Image)?;
+        let mut infos = Vec::new();
+        for (topic, stream) in [("color", Stream::Info), ("depth", Stream::DepthInfo)] {
+            let topic = format!("{camera}/{topic}/camera_info");
+            let mut subscription = node.subscription::<CameraInfo>(&topic, Qos::Image)?;
+            infos.push(Arc::clone(subscription.statistics()));
+            let arrivals = arrivals.clone();
+            node.spawn(async move {
+                loop {
+                    let info = Box::new(subscription.recv().await);
+                    let arrival = Arrival::Info(index, stream, info);
+                    if arrivals.send(arrival).await.is_err() {
+                        return;
+                    }
+                }
+            });
+        }
         self.cameras.push(CameraTopics {
             name: camera.to_owned(),
             depth: images.remove(1),
             color: images.remove(0),
-            info: Arc::clone(subscription.statistics()),
+            depth_info: infos.remove(1),
+            info: infos.remove(0),
+            pending: None,
+            skew: Skew::default(),
             color_arrival: None,
             depth_arrival: None,
             silent: false,
-        });
-        let arrivals = arrivals.clone();
-        node.spawn(async move {
-            loop {
-                let info = subscription.recv().await;
-                if arrivals
-                    .send(Arrival::Info(index, Box::new(info)))
-                    .await
-                    .is_err()
-                {
-                    return;
-                }
-            }
         });
         Ok(())
     }
 
     fn arrived(&mut self, arrival: Arrival) {
         let taken = match arrival {
-            Arrival::Info(camera, info) => self.views.calibrate(camera, &info).map(|()| false),
+            Arrival::Info(camera, stream, info) => {
+                let taken = self.views.calibrate(camera, stream, &info);
+                taken.map(|()| false)
+            }
             Arrival::Image(camera, stream, image) => {
                 let topics = &mut self.cameras[camera];
                 let arrival = match stream {
-                    Stream::Depth => &mut topics.depth_arrival,
+                    Stream::Depth | Stream::DepthInfo => &mut topics.depth_arrival,
                     Stream::Color | Stream::Info => &mut topics.color_arrival,
                 };
                 *arrival = Some(Instant::now());
+                let now_ns = ns_from_stamp(&self.clock.now());
+                let skew_s = (now_ns - ns_from_stamp(&image.header.stamp)) as f64 * 1e-9;
+                // A simulated clock that has not been heard yet says 0.
+                if now_ns != 0
+                    && let Some(skew_s) =
+                        topics.skew.add(skew_s, self.parameters.clock_skew_limit_s)
+                {
+                    let direction = if skew_s > 0.0 { "before" } else { "after" };
+                    warn!(
+                        "camera {}: its images arrive with stamps {:.3} s {direction} this host's time, expected at most {} s: synchronise \
+                         the clocks",
+                        topics.name,
+                        skew_s.abs(),
+                        self.parameters.clock_skew_limit_s
+                    );
+                }
                 self.views.image(camera, stream, image)
             }
         };
@@ -228,6 +305,14 @@ impl FusionNode {
     fn fuse(&mut self) {
         let start = Instant::now();
         let (fused, complaints) = self.views.fuse();
+        if fused.is_some() || !complaints.is_empty() {
+            for (index, camera) in self.cameras.iter_mut().enumerate() {
+                let mut complaints = complaints.iter();
+                if !complaints.any(|bad| bad.camera == index && bad.pending) {
+                    camera.pending = None;
+                }
+            }
+        }
         complaints.iter().for_each(|bad| self.complain(bad));
         if let Some(fused) = fused {
             self.publish(fused, start);
@@ -257,14 +342,36 @@ impl FusionNode {
         self.outputs.take(heightmap, header);
     }
 
-    fn complain(&self, complaint: &Complaint) {
-        let topics = &self.cameras[complaint.camera];
+    fn complain(&mut self, complaint: &Complaint) {
+        let topics = &mut self.cameras[complaint.camera];
         let statistics = match complaint.stream {
             Stream::Color => &topics.color,
             Stream::Depth => &topics.depth,
             Stream::Info => &topics.info,
+            Stream::DepthInfo => &topics.depth_info,
         };
-        statistics.reject(&complaint.reason);
+        if !complaint.pending {
+            statistics.reject(&complaint.reason);
+            return;
+        }
+        let pending = topics.pending.get_or_insert_with(|| Pending {
+            since: Instant::now(),
+            reason: String::new(),
+            told: false,
+        });
+        if pending.reason != complaint.reason {
+            pending.reason.clone_from(&complaint.reason);
+            pending.told = false;
+        }
+        if !pending.told && pending.since.elapsed() >= START_PATIENCE {
+            pending.told = true;
+            warn!(
+                "{}: {}; waited for it for {START_PATIENCE:?}, images of camera {} are not used",
+                statistics.name(),
+                complaint.reason,
+                topics.name
+            );
+        }
     }
 
     /// A camera is silent when nothing has come from it for the timeout while something has from
@@ -307,12 +414,21 @@ impl FusionNode {
             self.views.set_silent(index, camera.silent);
             let arrive = recent(camera.color_arrival) && recent(camera.depth_arrival);
             let (level, message) = match (missing.is_empty(), any) {
+                (true, _) if camera.pending.is_some() => {
+                    let reason = camera
+                        .pending
+                        .as_ref()
+                        .map_or("", |pending| &pending.reason);
+                    (Level::Warn, format!("waits: {reason}"))
+                }
                 (true, _) if arrive => (Level::Ok, "images arrive".to_owned()),
                 (true, _) => (Level::Stale, "no image yet".to_owned()),
                 (false, true) => (Level::Error, format!("no {} image", missing.join(" and "))),
                 (false, false) => (Level::Stale, "no camera sends images".to_owned()),
             };
             let seconds = |stamp: Duration| format!("{:.9}", stamp.as_secs_f64());
+            let skew = camera.skew.median_s();
+            let skew = skew.map(|skew_s| ("clock_skew_s", format!("{skew_s:.3}")));
             let used = self.used[index].map(|used| {
                 [
                     ("last_used_color_stamp_s", seconds(used.color)),
@@ -323,7 +439,7 @@ impl FusionNode {
                 format!("camera {}", camera.name),
                 level,
                 message,
-                used.into_iter().flatten(),
+                used.into_iter().flatten().chain(skew),
             );
         }
         let took_ms = format!("{:.2}", self.last_fusion.as_secs_f64() * 1e3);
@@ -342,5 +458,26 @@ impl FusionNode {
             last.into_iter().flatten(),
         );
         self.fuse_what_is_left();
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_clock_that_is_off_is_warned_about_once_and_a_single_late_image_is_not() {
+        let mut skew = Skew::default();
+        let mut warnings = |values: &[f64]| {
+            let new = values.iter().filter_map(|value| skew.add(*value, 1.0));
+            new.collect::<Vec<_>>()
+        };
+        assert_eq!(warnings(&[0.05; 20]), []);
+        assert_eq!(warnings(&[3.0]), []);
+        assert_eq!(warnings(&[0.05; 20]), []);
+        // Three seconds ahead of the host.
+        assert_eq!(warnings(&[-3.0; 30]), [-3.0]);
+        assert_eq!(warnings(&[0.1; 30]), []);
+        assert_eq!(warnings(&[5.0; 30]), [5.0]);
     }
 }

@@ -21,6 +21,10 @@ pub struct CameraFusionParameters {
     pub tolerance_s: f64,
     pub camera_timeout_s: f64,
     pub fuse_without_silent: bool,
+    pub frames: usize,
+    pub percentile: f64,
+    pub edge_step_m: f64,
+    pub clock_skew_limit_s: f64,
     pub workspace: WorkspaceParameters,
 }
 
@@ -47,6 +51,10 @@ impl Default for CameraFusionParameters {
             tolerance_s: 0.02,
             camera_timeout_s: 2.0,
             fuse_without_silent: false,
+            frames: 1,
+            percentile: 0.75,
+            edge_step_m: 0.02,
+            clock_skew_limit_s: 1.0,
             workspace: WorkspaceParameters::default(),
         }
     }
@@ -85,6 +93,10 @@ impl Parameters for CameraFusionParameters {
     const RANGES: &'static [(&'static str, Range)] = &[
         ("tolerance_s", Range::NOT_NEGATIVE),
         ("camera_timeout_s", Range::Float(0.001, 3600.0)),
+        ("frames", Range::Integer(1, 31)),
+        ("percentile", Range::SHARE),
+        ("edge_step_m", Range::POSITIVE),
+        ("clock_skew_limit_s", Range::POSITIVE),
         ("workspace.pixel_size_m", Range::POSITIVE),
         ("workspace.origin_x_m", Range::FINITE),
         ("workspace.origin_y_m", Range::FINITE),
@@ -156,6 +168,8 @@ mod tests {
         assert_eq!(refusal(|p| p.cameras[1] = "front".into()), "cameras");
         assert_eq!(refusal(|p| p.tolerance_s = f64::NAN), "tolerance_s");
         assert_eq!(refusal(|p| p.camera_timeout_s = 0.0), "camera_timeout_s");
+        assert_eq!(refusal(|p| p.frames = 0), "frames");
+        assert_eq!(refusal(|p| p.percentile = 1.5), "percentile");
         assert_eq!(refusal(|p| p.workspace.rows = 0), "workspace.rows");
         assert_eq!(refusal(|p| p.workspace.z_max_m = -1.0), "workspace.z_max_m");
     }

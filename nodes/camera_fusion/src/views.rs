@@ -5,7 +5,10 @@ use std::{
     time::Duration,
 };
 
-use heightmap::{Camera, Fusion, Heightmap, Intrinsics, View};
+use heightmap::{
+    BlobRule, Camera, ChangeRules, Fusion, FusionError, FusionReport, Heightmap, Intrinsics,
+    StillFusion, StillSettings, View, has_shape_of, largest_change, register_depth, scale_depth,
+};
 use msgs::{
     convert, sctn_msgs,
     sensor_msgs::{CameraInfo, Image},
@@ -13,7 +16,10 @@ use msgs::{
 };
 use nalgebra::Isometry3;
 
-use crate::{extrinsics::Transforms, parameters::CameraFusionParameters};
+use crate::{
+    extrinsics::{Transforms, plain},
+    parameters::CameraFusionParameters,
+};
 
 /// Images of one stream that wait for their counterparts.
 const WAITING_IMAGES: usize = 4;
@@ -27,8 +33,10 @@ pub enum Stream {
     Color,
     /// Depth images.
     Depth,
-    /// Calibration of the colour image, to which depth is registered.
+    /// Calibration of the colour image.
     Info,
+    /// Calibration of the depth image, needed where it has a frame of its own.
+    DepthInfo,
 }
 
 /// Why something that arrived cannot be used.
@@ -40,19 +48,48 @@ pub struct Complaint {
     pub stream: Stream,
     /// The field, what it is and what was expected.
     pub reason: String,
+    /// Something is missing that is sent once and may still be on its way, as a transform while the cameras start: worth a word only if
+    /// it stays away.
+    pub pending: bool,
 }
+
+impl Complaint {
+    fn new(camera: usize, stream: Stream, reason: impl ToString) -> Self {
+        Self {
+            camera,
+            stream,
+            reason: reason.to_string(),
+            pending: false,
+        }
+    }
+
+    fn pending(camera: usize, stream: Stream, reason: impl ToString) -> Self {
+        Self {
+            pending: true,
+            ..Self::new(camera, stream, reason)
+        }
+    }
+}
+
+/// A calibration as it arrived, or what is wrong with it; none before the first.
+type Calibration = Option<Result<Intrinsics, String>>;
 
 /// What has arrived of one camera.
 struct CameraState {
     name: String,
     /// From the calibration file, which wins over `/tf_static`.
     fixed_pose: Option<Isometry3<f64>>,
-    /// From the last calibration, or what is wrong with it.
-    intrinsics: Result<Intrinsics, String>,
+    /// Of the colour image, from the last calibration.
+    intrinsics: Calibration,
+    /// Of the depth image.
+    depth_intrinsics: Calibration,
     color: VecDeque<(Duration, Image)>,
     depth: VecDeque<(Duration, Image)>,
     rgb: Vec<u8>,
+    /// For the pixels of the colour image.
     depth_m: Vec<f32>,
+    /// As it was measured.
+    measured_m: Vec<f32>,
     /// Nothing has come for a while.
     silent: bool,
 }
@@ -70,6 +107,8 @@ pub struct Views {
     world_frame: String,
     tolerance: Duration,
     fusion: Fusion,
+    /// The median over several sets, where the parameters ask for that.
+    still: Option<StillFusion>,
     heightmap: Heightmap,
     last: Option<Duration>,
     fuse_without_silent: bool,
@@ -111,11 +150,13 @@ impl Views {
         let state = |name: &String| CameraState {
             name: name.clone(),
             fixed_pose: poses.remove(name),
-            intrinsics: Err("none has arrived".into()),
+            intrinsics: None,
+            depth_intrinsics: None,
             color: VecDeque::new(),
             depth: VecDeque::new(),
             rgb: Vec::new(),
             depth_m: Vec::new(),
+            measured_m: Vec::new(),
             silent: false,
         };
         Self {
@@ -124,6 +165,13 @@ impl Views {
             world_frame: parameters.world_frame.clone(),
             tolerance: Duration::from_secs_f64(parameters.tolerance_s),
             fusion: Fusion::default(),
+            still: (parameters.frames > 1).then(|| {
+                StillFusion::new(StillSettings {
+                    frames: parameters.frames,
+                    percentile: parameters.percentile,
+                    edge_step_m: parameters.edge_step_m as f32,
+                })
+            }),
             heightmap: Heightmap::new(parameters.workspace.workspace()),
             last: None,
             fuse_without_silent: parameters.fuse_without_silent,
@@ -146,18 +194,25 @@ impl Views {
         errors.iter().map(ToString::to_string).collect()
     }
 
-    /// Takes a calibration; it holds until the next. A bad one takes the last good one away.
-    pub fn calibrate(&mut self, camera: usize, message: &CameraInfo) -> Result<(), Complaint> {
+    /// Takes a calibration of the colour or the depth image; it holds until the next. A bad one takes the last good one away.
+    pub fn calibrate(
+        &mut self,
+        camera: usize,
+        stream: Stream,
+        message: &CameraInfo,
+    ) -> Result<(), Complaint> {
+        let read = convert::intrinsics_from_msg(message).map_err(|error| error.to_string());
         let state = &mut self.cameras[camera];
-        state.intrinsics = convert::intrinsics_from_msg(message).map_err(|error| error.to_string());
-        match &state.intrinsics {
+        let known = match stream {
+            Stream::DepthInfo | Stream::Depth => &mut state.depth_intrinsics,
+            Stream::Info | Stream::Color => &mut state.intrinsics,
+        };
+        let result = match &read {
             Ok(_) => Ok(()),
-            Err(reason) => Err(Complaint {
-                camera,
-                stream: Stream::Info,
-                reason: reason.clone(),
-            }),
-        }
+            Err(reason) => Err(Complaint::new(camera, stream, reason)),
+        };
+        *known = Some(read);
+        result
     }
 
     /// Takes an image. `true`: the clock was set back, and everything older is forgotten.
@@ -167,14 +222,14 @@ impl Views {
         stream: Stream,
         image: Image,
     ) -> Result<bool, Complaint> {
-        let stamp = convert::time_from_msg(&image.header.stamp).map_err(|error| Complaint {
-            camera,
-            stream,
-            reason: format!("header.{error}"),
-        })?;
+        let stamp = convert::time_from_msg(&image.header.stamp)
+            .map_err(|error| Complaint::new(camera, stream, format!("header.{error}")))?;
         let set_back = self.last.is_some_and(|last| stamp + CLOCK_SET_BACK < last);
         if set_back {
             self.last = None;
+            if let Some(still) = &mut self.still {
+                still.forget();
+            }
             for state in &mut self.cameras {
                 state.color.clear();
                 state.depth.clear();
@@ -186,7 +241,7 @@ impl Views {
         }
         let state = &mut self.cameras[camera];
         let waiting = match stream {
-            Stream::Depth => &mut state.depth,
+            Stream::Depth | Stream::DepthInfo => &mut state.depth,
             Stream::Color | Stream::Info => &mut state.color,
         };
         waiting.retain(|(waiting, _)| *waiting != stamp);
@@ -203,7 +258,7 @@ impl Views {
         let mut before = Duration::MAX;
         while let Some(reference) = self.newest_reference(before) {
             match self.fuse_at(reference) {
-                Ok(fused) => return (Some(fused), complaints),
+                Ok(fused) => return (fused, complaints),
                 Err(bad) => bad.into_iter().for_each(|bad| {
                     if !complaints.contains(&bad) {
                         complaints.push(bad);
@@ -215,7 +270,8 @@ impl Views {
         (None, complaints)
     }
 
-    fn fuse_at(&mut self, reference: Duration) -> Result<Fused, Vec<Complaint>> {
+    /// None where more frames of the still scene are needed.
+    fn fuse_at(&mut self, reference: Duration) -> Result<Option<Fused>, Vec<Complaint>> {
         let (mut cameras, mut complaints) = (Vec::new(), Vec::new());
         let without = self.fuse_without_silent;
         for (index, state) in self.cameras.iter_mut().enumerate() {
@@ -249,22 +305,20 @@ impl Views {
                 })
             })
             .collect();
-        let general = |reason: String| {
-            vec![Complaint {
-                camera: 0,
-                stream: Stream::Color,
-                reason,
-            }]
-        };
+        let general = |reason: String| vec![Complaint::new(0, Stream::Color, reason)];
         self.last = Some(stamp);
-        let report = self
-            .fusion
-            .fuse(&views, &mut self.heightmap)
-            .map_err(|error| general(error.to_string()))?;
+        let report = match &mut self.still {
+            None => self.fusion.fuse(&views, &mut self.heightmap).map(Some),
+            Some(still) => fuse_still(still, &views, &mut self.heightmap),
+        };
+        let report = report.map_err(|error| general(error.to_string()))?;
         for state in &mut self.cameras {
             state.color.retain(|(waiting, _)| *waiting > stamp);
             state.depth.retain(|(waiting, _)| *waiting > stamp);
         }
+        let Some(report) = report else {
+            return Ok(None);
+        };
         let message = convert::header(stamp, &self.world_frame).and_then(|header| {
             convert::heightmap_to_msg(
                 self.heightmap.clone(),
@@ -273,12 +327,12 @@ impl Views {
                 report.coverage,
             )
         });
-        Ok(Fused {
+        Ok(Some(Fused {
             message: message.map_err(|error| general(error.to_string()))?,
             heightmap: self.heightmap.clone(),
             stamp,
             used,
-        })
+        }))
     }
 
     /// The newest colour stamp before another about which every camera has an image of both streams.
@@ -306,6 +360,42 @@ impl Views {
     }
 }
 
+/// What moves while a set of images is compared with the median of those before: an arm or a hand, not the noise of a single set.
+const MOTION: ChangeRules = {
+    let rule = BlobRule {
+        height_m: 0.015,
+        area_m2: 400e-6,
+    };
+    ChangeRules {
+        near: rule,
+        far: rule,
+        near_m: 0.0,
+        hidden_area_m2: f64::INFINITY,
+    }
+};
+
+/// Takes one more set; the median once there are as many as asked for in which nothing has moved.
+fn fuse_still(
+    still: &mut StillFusion,
+    views: &[View<'_>],
+    heightmap: &mut Heightmap,
+) -> Result<Option<FusionReport>, FusionError> {
+    let before = (!still.is_empty()).then(|| {
+        let mut before = Heightmap::new(heightmap.workspace);
+        still.median(&mut before);
+        before
+    });
+    still.push(views, &heightmap.workspace)?;
+    if let Some(before) = before {
+        still.last(heightmap);
+        if !matches!(largest_change(&before, heightmap, &MOTION, &[]), Ok(None)) {
+            still.forget();
+            still.push(views, &heightmap.workspace)?;
+        }
+    }
+    Ok(still.is_full().then(|| still.median(heightmap)))
+}
+
 impl CameraState {
     /// Converts the images nearest to a stamp. Images that cannot be used are dropped, so that they are
     /// complained about once.
@@ -316,11 +406,7 @@ impl CameraState {
         transforms: &Transforms,
         world_frame: &str,
     ) -> Result<(Camera, Used), Vec<Complaint>> {
-        let complaint = |stream, reason: String| Complaint {
-            camera: index,
-            stream,
-            reason,
-        };
+        let complaint = |stream, reason: String| Complaint::new(index, stream, reason);
         let nearest = |waiting: &VecDeque<(Duration, Image)>| {
             let stamps = waiting.iter().map(|(stamp, _)| stamp.abs_diff(reference));
             let nearest = stamps.enumerate().min_by_key(|(_, distance)| *distance);
@@ -330,12 +416,16 @@ impl CameraState {
             return Err(vec![complaint(Stream::Color, "no image".into())]);
         };
         let intrinsics = match &self.intrinsics {
-            Ok(intrinsics) => *intrinsics,
-            Err(reason) => {
+            Some(Ok(intrinsics)) => *intrinsics,
+            Some(Err(reason)) => {
                 return Err(vec![complaint(
                     Stream::Info,
                     format!("images cannot be used without a valid calibration: {reason}"),
                 )]);
+            }
+            None => {
+                let reason = "images cannot be used without a calibration, none has arrived";
+                return Err(vec![Complaint::pending(index, Stream::Info, reason)]);
             }
         };
         let frame = &self.color[color].1.header.frame_id;
@@ -346,10 +436,8 @@ impl CameraState {
         let world_from_camera = match pose {
             Ok(pose) => pose,
             Err(error) => {
-                return Err(vec![complaint(
-                    Stream::Color,
-                    format!("header.frame_id: {error}"),
-                )]);
+                let reason = format!("header.frame_id: {error}");
+                return Err(vec![Complaint::pending(index, Stream::Color, reason)]);
             }
         };
         let camera = Camera {
@@ -371,17 +459,99 @@ impl CameraState {
             bad.push(complaint(Stream::Color, error.to_string()));
             self.color.remove(color);
         }
-        if let Err(error) =
-            convert::depth_from_msg(&self.depth[depth].1, &intrinsics, &mut self.depth_m)
-        {
-            bad.push(complaint(Stream::Depth, error.to_string()));
-            self.depth.remove(depth);
+        match self.register(index, color, depth, &camera, transforms) {
+            Ok(()) => {}
+            // It can be used when what is missing comes.
+            Err(missing) if missing.pending => bad.push(missing),
+            Err(refused) => {
+                bad.push(refused);
+                self.depth.remove(depth);
+            }
         }
         if bad.is_empty() {
             Ok((camera, used))
         } else {
             Err(bad)
         }
+    }
+
+    /// Fills `depth_m` from a depth image: as it is where it is of the colour image's frame and size, scaled where only the size differs,
+    /// registered where the frame differs, by way of the transform between both frames and the depth image's own calibration.
+    fn register(
+        &mut self,
+        index: usize,
+        color: usize,
+        depth: usize,
+        camera: &Camera,
+        transforms: &Transforms,
+    ) -> Result<(), Complaint> {
+        let refuse = |stream, reason: String| Complaint::new(index, stream, reason);
+        let image = &self.depth[depth].1;
+        let size_px = (image.width as usize, image.height as usize);
+        // A colour image that was refused has left the queue.
+        let color_frame = match self.color.get(color) {
+            Some((_, image)) => image.header.frame_id.as_str(),
+            None => image.header.frame_id.as_str(),
+        };
+        let depth_frame = image.header.frame_id.as_str();
+        let expected = &camera.intrinsics;
+        let read = convert::depth_from_msg(image, &mut self.measured_m);
+        read.map_err(|error| refuse(Stream::Depth, error.to_string()))?;
+        if plain(depth_frame) == plain(color_frame) {
+            if size_px == (expected.width, expected.height) {
+                std::mem::swap(&mut self.depth_m, &mut self.measured_m);
+            } else if has_shape_of(expected, size_px.0, size_px.1) {
+                scale_depth(&self.measured_m, size_px, expected, &mut self.depth_m);
+            } else {
+                return Err(refuse(
+                    Stream::Depth,
+                    format!(
+                        "width and height are {} and {}, expected those of the colour image, {} and {}, or the same shape in another \
+                         size",
+                        size_px.0, size_px.1, expected.width, expected.height
+                    ),
+                ));
+            }
+            return Ok(());
+        }
+        let differ = format!(
+            "header.frame_id is {depth_frame:?}, expected that of the colour image, {color_frame:?}, since depth must be registered to it"
+        );
+        let Some(color_from_depth) = transforms.between(color_frame, depth_frame) else {
+            let reason = format!("{differ}, or transforms between the two frames");
+            return Err(Complaint::pending(index, Stream::Depth, reason));
+        };
+        let intrinsics = match &self.depth_intrinsics {
+            Some(Ok(intrinsics)) => *intrinsics,
+            Some(Err(reason)) => {
+                let reason =
+                    format!("{differ}, or a valid calibration of the depth image: {reason}");
+                return Err(refuse(Stream::DepthInfo, reason));
+            }
+            None => {
+                let reason =
+                    format!("{differ}, or a calibration of the depth image, none has arrived");
+                return Err(Complaint::pending(index, Stream::DepthInfo, reason));
+            }
+        };
+        let depth_camera = Camera {
+            name: format!("{} depth", camera.name),
+            intrinsics,
+            world_from_camera: camera.world_from_camera * color_from_depth,
+        };
+        let checked = depth_camera.check();
+        checked.map_err(|error| refuse(Stream::DepthInfo, error.to_string()))?;
+        if size_px != (intrinsics.width, intrinsics.height) {
+            return Err(refuse(
+                Stream::Depth,
+                format!(
+                    "width and height are {} and {}, expected those of its calibration, {} and {}",
+                    size_px.0, size_px.1, intrinsics.width, intrinsics.height
+                ),
+            ));
+        }
+        register_depth(&self.measured_m, &depth_camera, camera, &mut self.depth_m);
+        Ok(())
     }
 }
 
@@ -447,7 +617,7 @@ mod tests {
     fn calibrate(views: &mut Views) {
         for camera in 0..2 {
             let info = convert::intrinsics_to_msg(Header::default(), &CAMERA);
-            views.calibrate(camera, &info).unwrap();
+            views.calibrate(camera, Stream::Info, &info).unwrap();
         }
     }
 
@@ -621,6 +791,7 @@ mod tests {
         let complaints = views.fuse().1;
         assert_eq!((complaints.len(), complaints[0].camera), (1, 1));
         assert!(complaints[0].reason.contains("\"left\""), "{complaints:?}");
+        assert!(complaints[0].pending);
         views.transform(extrinsics(&["left"]));
         assert_eq!(fused_stamp_ms(&mut views), Some(1000));
     }
@@ -668,7 +839,7 @@ mod tests {
         let mut views = ready();
         let mut info = convert::intrinsics_to_msg(Header::default(), &CAMERA);
         info.k[0] = 0.0;
-        let complaint = views.calibrate(1, &info).unwrap_err();
+        let complaint = views.calibrate(1, Stream::Info, &info).unwrap_err();
         assert_eq!((complaint.camera, complaint.stream), (1, Stream::Info));
         send(&mut views, 0, 1000);
         send(&mut views, 1, 1000);
@@ -699,6 +870,146 @@ mod tests {
                 .height_m
                 .iter()
                 .all(|height| height.is_finite())
+        );
+    }
+
+    #[test]
+    fn with_several_frames_a_heightmap_is_their_median_and_waits_until_nothing_moves() {
+        let parameters = CameraFusionParameters {
+            cameras: vec!["front".into(), "left".into()],
+            frames: 3,
+            ..CameraFusionParameters::default()
+        };
+        let mut views = Views::new(&parameters, BTreeMap::new());
+        views.transform(extrinsics(&["front", "left"]));
+        // A point in every cell that it sees.
+        let dense = Intrinsics {
+            width: 160,
+            height: 120,
+            fx_px: 300.0,
+            fy_px: 300.0,
+            cx_px: 79.5,
+            cy_px: 59.5,
+            ..CAMERA
+        };
+        let info = convert::intrinsics_to_msg(Header::default(), &dense);
+        for camera in 0..2 {
+            views.calibrate(camera, Stream::Info, &info).unwrap();
+        }
+        let mut fuse = |stamp_ms: u64, height_m: f32| {
+            let stamp = Duration::from_millis(stamp_ms);
+            for (camera, frame) in ["front", "left"].into_iter().enumerate() {
+                views
+                    .image(camera, Stream::Color, color(stamp, frame))
+                    .unwrap();
+                let depth = depth(stamp, frame, height_m);
+                views.image(camera, Stream::Depth, depth).unwrap();
+            }
+            let (fused, complaints) = views.fuse();
+            assert_eq!(complaints, []);
+            fused.map(|fused| {
+                let heights = fused.message.height_m.iter().copied();
+                (fused.stamp.as_millis(), heights.fold(0.0, f32::max))
+            })
+        };
+        assert_eq!(fuse(1000, 0.050), None);
+        assert_eq!(fuse(1033, 0.054), None);
+        let (stamp_ms, height_m) = fuse(1066, 0.051).unwrap();
+        assert_eq!(stamp_ms, 1066);
+        assert!((height_m - 0.051).abs() < 1e-4, "{height_m}");
+        // Something has moved: three frames of the new scene.
+        assert_eq!(fuse(1100, 0.100), None);
+        assert_eq!(fuse(1133, 0.101), None);
+        let (stamp_ms, height_m) = fuse(1166, 0.099).unwrap();
+        assert_eq!(stamp_ms, 1166);
+        assert!((height_m - 0.1).abs() < 1e-4, "{height_m}");
+    }
+
+    /// Both cameras, with this depth image of the second one.
+    fn fuse_with_depth(views: &mut Views, depth: Image) -> (Option<Fused>, Vec<Complaint>) {
+        send(views, 0, 1000);
+        send(views, 1, 1000);
+        views.image(1, Stream::Depth, depth).unwrap();
+        views.fuse()
+    }
+
+    const HALF: Intrinsics = Intrinsics {
+        width: 32,
+        height: 24,
+        fx_px: 15.0,
+        fy_px: 15.0,
+        cx_px: 15.5,
+        cy_px: 11.5,
+        distortion: Distortion::NONE,
+    };
+
+    fn half_depth(frame: &str) -> Image {
+        let stamp = Duration::from_millis(1000);
+        let depth_m = vec![0.95; HALF.len()];
+        convert::depth_to_msg(header(stamp, frame), &HALF, &depth_m).unwrap()
+    }
+
+    #[test]
+    fn depth_of_another_size_in_the_colour_frame_is_scaled() {
+        let (fused, complaints) = fuse_with_depth(&mut ready(), half_depth("left"));
+        assert_eq!(complaints, []);
+        let whole = fuse_with_depth(
+            &mut ready(),
+            depth(Duration::from_millis(1000), "left", 0.05),
+        );
+        assert_eq!(fused.unwrap().message, whole.0.unwrap().message);
+        // A crop shows something else.
+        let crop = Intrinsics {
+            width: 48,
+            ..CAMERA
+        };
+        let stamp = Duration::from_millis(1000);
+        let image = convert::depth_to_msg(header(stamp, "left"), &crop, &vec![0.95; crop.len()]);
+        let (fused, complaints) = fuse_with_depth(&mut ready(), image.unwrap());
+        assert_eq!((fused, complaints.len()), (None, 1));
+        let reason = &complaints[0].reason;
+        assert!(
+            reason.contains("48 and 48, expected") && reason.contains("64 and 48"),
+            "{reason}"
+        );
+    }
+
+    #[test]
+    fn depth_of_a_frame_of_its_own_is_registered_when_transforms_and_its_calibration_are_there() {
+        let mut views = ready();
+        let (fused, complaints) = fuse_with_depth(&mut views, half_depth("left_depth"));
+        assert_eq!((fused, complaints.len()), (None, 1));
+        assert!(complaints[0].pending);
+        for word in ["\"left_depth\"", "\"left\"", "registered"] {
+            assert!(complaints[0].reason.contains(word), "{complaints:?}");
+        }
+        // Its camera is 10 cm further up than the colour camera.
+        let mut pose = extrinsics(&["left_depth"]);
+        pose.transforms[0].transform.translation.z = 1.1;
+        views.transform(pose);
+        let (fused, complaints) = views.fuse();
+        assert_eq!((fused, complaints[0].stream), (None, Stream::DepthInfo));
+        assert!(complaints[0].pending, "{complaints:?}");
+        let info = convert::intrinsics_to_msg(Header::default(), &HALF);
+        views.calibrate(1, Stream::DepthInfo, &info).unwrap();
+        let (fused, complaints) = views.fuse();
+        assert_eq!(complaints, []);
+        // 0.95 m below 1.1 m.
+        let height_m = fused.unwrap().message.height_m;
+        let top = height_m.iter().copied().fold(0.0, f32::max);
+        assert!((top - 0.15).abs() < 1e-4, "{top}");
+        // A calibration of another size is refused by name.
+        let other = convert::intrinsics_to_msg(Header::default(), &CAMERA);
+        views.calibrate(1, Stream::DepthInfo, &other).unwrap();
+        send(&mut views, 0, 1100);
+        send(&mut views, 1, 1100);
+        let mut late = half_depth("left_depth");
+        late.header = header(Duration::from_millis(1100), "left_depth");
+        views.image(1, Stream::Depth, late).unwrap();
+        let complaints = views.fuse().1;
+        assert!(
+            complaints[0].reason.contains("calibration"),
+            "{complaints:?}"
         );
     }
 

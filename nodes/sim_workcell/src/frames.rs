@@ -143,7 +143,7 @@ mod tests {
         let intrinsics = convert::intrinsics_from_msg(&frame.info).unwrap();
         assert_eq!(intrinsics, camera.intrinsics);
         convert::color_from_msg(&frame.color, &intrinsics, &mut rgb).unwrap();
-        convert::depth_from_msg(&frame.depth, &intrinsics, &mut depth_m).unwrap();
+        convert::depth_from_msg(&frame.depth, &mut depth_m).unwrap();
         assert_eq!((rgb, depth_m), (image.rgb, image.depth_m));
         let tf = camera_transforms(std::slice::from_ref(&camera), "world", Duration::ZERO).unwrap();
         assert_eq!(tf.transforms[0].child_frame_id, frame.color.header.frame_id);

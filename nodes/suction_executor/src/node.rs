@@ -54,6 +54,9 @@ pub async fn configure(
         path => WorkCell::load(path),
     }
     .context("parameter urdf")?;
+    if let Some(warning) = work_cell.warning() {
+        warn!("parameter urdf: {warning}");
+    }
     let origin = Instant::now();
     let status = follow_status(&node, &parameters.driver, &work_cell.joint_names, origin)?;
     let link = Link::new(

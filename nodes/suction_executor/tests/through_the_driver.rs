@@ -199,7 +199,7 @@ impl Bench {
             let intrinsics = convert::intrinsics_from_msg(&info).unwrap();
             let (mut rgb, mut depth_m) = (Vec::new(), Vec::new());
             convert::color_from_msg(&color, &intrinsics, &mut rgb).unwrap();
-            convert::depth_from_msg(&depth, &intrinsics, &mut depth_m).unwrap();
+            convert::depth_from_msg(&depth, &mut depth_m).unwrap();
             let world_from_camera = self.poses[&info.header.frame_id];
             views.push((
                 Camera {

@@ -570,7 +570,8 @@ impl<A: Action + 'static> ActionClient<A> {
 
     /// Waits until a server is discovered.
     pub async fn wait_for_server(&self, limit: Duration) -> Result<(), CallError> {
-        self.graph.wait_for_action(&self.name, limit).await
+        let discovered = self.graph.wait_for_action(&self.name, limit).await;
+        CallError::unless_discovered(discovered, &self.name, limit)
     }
 
     /// Sends a goal, again under the same id if no reply comes, so that it is executed once.

@@ -19,12 +19,10 @@ use crate::{
     lifecycle::{Active, Lifecycle},
     logging,
     node::Node,
+    parameter_services,
     parameter_store::ParameterStore,
     parameters::{self, Loaded, Parameters},
 };
-
-/// How long a node that waits for the end of its work may take to tidy up.
-pub(crate) const GRACE: Duration = Duration::from_secs(2);
 
 /// Where to look for other nodes.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -178,7 +176,9 @@ impl Context {
             arguments,
             loaded.use_sim_time,
             ParameterStore::new(&loaded, configured)?,
+            loaded.qos_overrides.clone(),
         )?;
+        parameter_services::serve(&node, node.parameter_store())?;
         Ok((node, loaded))
     }
 

@@ -12,7 +12,10 @@ use msgs::{
     std_msgs::Header,
 };
 
-use crate::statistics::{Direction, Snapshot, Statistics};
+use crate::{
+    endpoint::Direction,
+    statistics::{Snapshot, Statistics},
+};
 
 pub(crate) const PERIOD: Duration = Duration::from_secs(1);
 

@@ -11,9 +11,9 @@ use std::{
 
 use msgs::rmw_dds_common::ParticipantEntitiesInfo;
 use ros2_client::Gid;
-use rustdds::{DomainParticipant, GUID, QosPolicies, RTPSEntity, discovery::DiscoveredWriterData};
+use rustdds::{DomainParticipant, GUID, RTPSEntity, discovery::DiscoveredWriterData};
 
-use crate::{service::CallError, statistics::Direction};
+use crate::endpoint::{Conflict, Direction, Endpoint};
 
 /// The type with which ros2-client subscribes to `/clock`.
 const CLOCK_OF_ROS2_CLIENT: &str = "builtin_interfaces::msg::dds_::Time_";
@@ -40,6 +40,17 @@ impl Graph {
         self.readers(&format!("rt{topic}"))
     }
 
+    /// Whether every publisher of a topic (absolute name) offers reliability. None: it has no publisher.
+    pub(crate) fn offers_reliability(&self, topic: &str) -> Option<bool> {
+        let dds_topic = format!("rt{topic}");
+        let writers = self.discovered_writers();
+        writers
+            .iter()
+            .filter(|writer| writer.publication_topic_data.topic_name == dds_topic)
+            .map(|writer| writer.publication_topic_data.qos().is_reliable())
+            .reduce(|all, one| all && one)
+    }
+
     /// Whether a service (absolute name) has a server.
     pub fn has_service(&self, name: &str) -> bool {
         self.readers(&format!("rq{name}Request")) > 0 && self.writers(&format!("rr{name}Reply")) > 0
@@ -62,26 +73,14 @@ impl Graph {
         self.wait(limit, || self.publishers(topic) > 0).await
     }
 
-    pub(crate) async fn wait_for_service(
-        &self,
-        name: &str,
-        limit: Duration,
-    ) -> Result<(), CallError> {
-        self.wait(limit, || self.has_service(name))
-            .await
-            .then_some(())
-            .ok_or_else(|| unavailable(name, limit))
+    /// Waits until a service has a server. `false`: it has none after `limit`.
+    pub(crate) async fn wait_for_service(&self, name: &str, limit: Duration) -> bool {
+        self.wait(limit, || self.has_service(name)).await
     }
 
-    pub(crate) async fn wait_for_action(
-        &self,
-        name: &str,
-        limit: Duration,
-    ) -> Result<(), CallError> {
-        self.wait(limit, || self.has_action(name))
-            .await
-            .then_some(())
-            .ok_or_else(|| unavailable(name, limit))
+    /// Waits until an action has a server. `false`: it has none after `limit`.
+    pub(crate) async fn wait_for_action(&self, name: &str, limit: Duration) -> bool {
+        self.wait(limit, || self.has_action(name)).await
     }
 
     /// Waits until the reader of a client's answers is discovered. rmw names the reader itself in its requests, ros2-client its writer
@@ -256,93 +255,5 @@ impl NodeNames {
                 })
             })
         })
-    }
-}
-
-/// A publisher or subscription of this node.
-#[derive(Clone, Debug, PartialEq)]
-pub(crate) struct Endpoint {
-    /// Absolute name of the topic.
-    pub topic: String,
-    pub direction: Direction,
-    /// As DDS names it.
-    pub type_name: String,
-    pub policies: QosPolicies,
-}
-
-/// An endpoint of this node and one of another that do not fit together.
-#[derive(Clone, Debug, PartialEq, Eq)]
-pub(crate) struct Conflict {
-    pub topic: String,
-    pub remote: GUID,
-    /// Ours.
-    direction: Direction,
-    mismatch: Mismatch,
-}
-
-/// What does not fit.
-#[derive(Clone, Debug, PartialEq, Eq)]
-enum Mismatch {
-    /// Our type, and the other's.
-    Type(String, String),
-    /// Which policy.
-    Policy(String),
-}
-
-impl Conflict {
-    /// Names both ends: `ours` and `theirs` are the nodes, the other one where it is known.
-    pub(crate) fn describe(&self, ours: &str, theirs: Option<&str>) -> String {
-        let (own, other) = match self.direction {
-            Direction::In => ("subscription", "publisher"),
-            Direction::Out => ("publisher", "subscription"),
-        };
-        let theirs = match theirs {
-            Some(name) => name.to_owned(),
-            None => format!("a node that has not said its name ({:?})", self.remote),
-        };
-        let topic = &self.topic;
-        match &self.mismatch {
-            Mismatch::Type(our_type, their_type) => format!(
-                "{topic}: the {own} of {ours} has type {our_type}, the {other} of {theirs} has {their_type}"
-            ),
-            Mismatch::Policy(policy) => format!(
-                "{topic}: no messages between the {own} of {ours} and the {other} of {theirs}: the {policy} \
-                 offered is less than the one requested"
-            ),
-        }
-    }
-}
-
-impl Endpoint {
-    fn is_on(&self, dds_topic: &str) -> bool {
-        dds_topic.strip_prefix("rt") == Some(self.topic.as_str())
-    }
-
-    fn conflict(
-        &self,
-        remote: GUID,
-        type_name: &str,
-        offered: &QosPolicies,
-        requested: &QosPolicies,
-    ) -> Option<Conflict> {
-        let mismatch = if type_name != self.type_name {
-            Mismatch::Type(self.type_name.clone(), type_name.to_owned())
-        } else {
-            let policy = offered.compliance_failure_wrt(requested)?;
-            Mismatch::Policy(format!("{policy:?}"))
-        };
-        Some(Conflict {
-            topic: self.topic.clone(),
-            remote,
-            direction: self.direction,
-            mismatch,
-        })
-    }
-}
-
-fn unavailable(name: &str, waited: Duration) -> CallError {
-    CallError::Unavailable {
-        name: name.to_owned(),
-        waited,
     }
 }

@@ -8,7 +8,10 @@ mod arguments;
 mod clock;
 mod context;
 mod diagnostics;
+mod endpoint;
 mod graph;
+mod image_subscription;
+mod invalid_parameter;
 mod lifecycle;
 pub mod logging;
 mod node;
@@ -18,6 +21,7 @@ mod parameter_store;
 mod parameters;
 mod plain;
 mod qos;
+mod qos_overrides;
 mod raw;
 mod service;
 mod statistics;
@@ -29,15 +33,17 @@ pub use clock::{Clock, ns_from_stamp, stamp_from_ns};
 pub use context::{Context, ContextError, Network, main, wait_for_end};
 pub use diagnostics::{Diagnostics, Level};
 pub use graph::Graph;
+pub use image_subscription::ImageSubscription;
+pub use invalid_parameter::InvalidParameter;
 pub use lifecycle::{Active, LifecycleClient, LifecycleError, State, Transition};
 pub use node::{Node, NodeError};
 pub use once::{InvalidRequestId, Once};
 pub use parameters::{
-    InvalidParameter, Loaded, NoParameters, ParameterError, Parameters, Range, load_text,
-    mistakes_in_documentation,
+    Loaded, NoParameters, ParameterError, Parameters, Range, load_text, mistakes_in_documentation,
 };
 pub use plain::plain_node;
 pub use qos::Qos;
+pub use qos_overrides::QosOverrides;
 pub use raw::{
     AsBytes, NoCdr, Offer, PublisherId, RawMessage, RawPublisher, RawQos, RawSubscription,
 };

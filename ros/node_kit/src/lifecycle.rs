@@ -24,7 +24,6 @@ use tokio::{
 use tracing::{error, info};
 
 use crate::{
-    context::GRACE,
     diagnostics::Level,
     node::{Node, NodeError},
     parameters::Parameters,
@@ -32,6 +31,9 @@ use crate::{
     service::{CallError, CallOptions, ServiceClient},
     topic::Publisher,
 };
+
+/// How long a node that waits for the end of its work may take to tidy up.
+const GRACE: Duration = Duration::from_secs(2);
 
 /// Requests that wait for the transition under way.
 const WAITING_REQUESTS: usize = 8;

@@ -27,8 +27,8 @@ const SPAN: &str = "node";
 
 /// RustDDS logs an error for every endpoint of a node that ends, which is none: of its errors only those of
 /// its two threads are said, without which a node would be deaf, and not those of what has been discovered:
-/// ros2-client reads `/clock` with another type. RUST_LOG=rustdds=warn shows all.
-const DEFAULT_FILTER: &str = "info,rustdds=off,rustdds::rtps::dp_event_loop=error,rustdds::discovery=error,\
+/// ros2-client reads `/clock` with another type. A receive buffer that is too small is said too. RUST_LOG=rustdds=warn shows all.
+const DEFAULT_FILTER: &str = "info,rustdds=off,rustdds::receive_buffer=warn,rustdds::rtps::dp_event_loop=error,rustdds::discovery=error,\
     rustdds::discovery::discovery_db=off,ros2_client=error";
 
 /// What writes to `/rosout` for each node of this process.

@@ -26,14 +26,17 @@ use crate::{
     arguments::RosArguments,
     clock::Clock,
     diagnostics::{self, Diagnostics, Level},
-    graph::{Conflict, Endpoint, Graph, NodeNames},
-    logging, parameter_services,
+    endpoint::{Conflict, Direction, Endpoint},
+    graph::{Graph, NodeNames},
+    invalid_parameter::InvalidParameter,
+    logging,
     parameter_store::ParameterStore,
     parameters::Parameters,
-    qos::Qos,
+    qos::{Qos, QosOverride},
+    qos_overrides::QosOverrides,
     raw::{self, RawPublisher, RawQos, RawSubscription},
     service::{ServiceClient, ServiceServer},
-    statistics::{Direction, Statistics},
+    statistics::Statistics,
     topic::{Publisher, Subscription},
 };
 
@@ -50,6 +53,9 @@ pub enum NodeError {
         /// Which rule.
         reason: String,
     },
+    /// A parameter below `qos_overrides` asks for what a topic cannot do without.
+    #[error(transparent)]
+    Override(#[from] InvalidParameter),
     /// The middleware refused.
     #[error("{what} {name}: {reason}")]
     Middleware {
@@ -127,6 +133,7 @@ struct Inner {
     full_name: String,
     clock: Clock,
     parameters: Arc<ParameterStore>,
+    qos_overrides: QosOverrides,
     statistics: Mutex<Vec<Arc<Statistics>>>,
     diagnostics: Diagnostics,
     span: tracing::Span,
@@ -194,6 +201,7 @@ impl Node {
         arguments: &RosArguments,
         use_sim_time: bool,
         parameters: ParameterStore,
+        qos_overrides: QosOverrides,
     ) -> Result<Self, NodeError> {
         let name = arguments.node_name(default_name);
         let namespace = arguments.namespace(default_name);
@@ -229,6 +237,7 @@ impl Node {
                 full_name,
                 clock,
                 parameters: Arc::new(parameters),
+                qos_overrides,
                 statistics: Mutex::default(),
                 diagnostics: Diagnostics::default(),
                 span,
@@ -245,7 +254,6 @@ impl Node {
         tokio::spawn(spinning.instrument(node.inner.span.clone()));
         node.follow_clock()?;
         node.publish_diagnostics()?;
-        parameter_services::serve(&node, &node.inner.parameters)?;
         Ok(node)
     }
 
@@ -288,7 +296,7 @@ impl Node {
         newest.expect("the type of parameters that the node was made with")
     }
 
-    pub(crate) fn parameter_store(&self) -> &ParameterStore {
+    pub(crate) fn parameter_store(&self) -> &Arc<ParameterStore> {
         &self.inner.parameters
     }
 
@@ -392,6 +400,37 @@ impl Node {
             .ros()
             .create_subscription(&topic, None)
             .map_err(|error| NodeError::middleware("subscription", &statistics.name, error))?;
+        Ok(Subscription::new(inner, statistics))
+    }
+
+    /// Subscribes to a topic of images anew, reliably or not, whatever its profile says. What `qos_overrides` asks for wins.
+    pub(crate) fn image_subscription<M: Interface>(
+        &self,
+        topic: &str,
+        reliable: bool,
+    ) -> Result<Subscription<M>, NodeError> {
+        let full = self.resolve(topic);
+        let mut wish = self
+            .inner
+            .qos_overrides
+            .of(&full, Direction::In, Qos::Image)?;
+        wish.reliable.get_or_insert(reliable);
+        let dds_type = message_type_name::<M>().dds_msg_type();
+        let policies = Qos::Image.policies(Direction::In, wish);
+        // Counted, and compared with publishers, as what it is at least: it follows them.
+        let asked_for = Qos::Image.policies(Direction::In, QosOverride::default());
+        let endpoint = Endpoint {
+            topic: full.clone(),
+            direction: Direction::In,
+            type_name: dds_type.clone(),
+            policies: asked_for,
+        };
+        let topic = self.create_dds_topic(&full, dds_type, &policies)?;
+        let statistics = self.statistics(Statistics::new(&full, Direction::In).of(endpoint));
+        let inner = self
+            .ros()
+            .create_subscription(&topic, None)
+            .map_err(|error| NodeError::middleware("subscription", &full, error))?;
         Ok(Subscription::new(inner, statistics))
     }
 
@@ -590,7 +629,9 @@ impl Node {
         direction: Direction,
     ) -> Result<(Arc<Statistics>, Topic), NodeError> {
         let dds_type = message_type_name::<M>().dds_msg_type();
-        self.dds_topic(name, dds_type, qos.policies(direction), direction)
+        let full = self.resolve(name);
+        let wish = self.inner.qos_overrides.of(&full, direction, qos)?;
+        self.dds_topic(name, dds_type, qos.policies(direction, wish), direction)
     }
 
     fn dds_topic(
@@ -601,17 +642,7 @@ impl Node {
         direction: Direction,
     ) -> Result<(Arc<Statistics>, Topic), NodeError> {
         let (full, _) = self.ros_name("topic", name)?;
-        let topic = self
-            .inner
-            .context
-            .domain_participant()
-            .create_topic(
-                format!("rt{full}"),
-                type_name.clone(),
-                &policies,
-                TopicKind::NoKey,
-            )
-            .map_err(|error| NodeError::middleware("topic", &full, format!("{error:?}")))?;
+        let topic = self.create_dds_topic(&full, type_name.clone(), &policies)?;
         let endpoint = Endpoint {
             topic: full.clone(),
             direction,
@@ -620,6 +651,18 @@ impl Node {
         };
         let statistics = Statistics::new(&full, direction).of(endpoint);
         Ok((self.statistics(statistics), topic))
+    }
+
+    fn create_dds_topic(
+        &self,
+        full: &str,
+        type_name: String,
+        policies: &QosPolicies,
+    ) -> Result<Topic, NodeError> {
+        let participant = self.inner.context.domain_participant();
+        participant
+            .create_topic(format!("rt{full}"), type_name, policies, TopicKind::NoKey)
+            .map_err(|error| NodeError::middleware("topic", full, format!("{error:?}")))
     }
 
     fn follow_clock(&self) -> Result<(), NodeError> {

@@ -16,8 +16,9 @@ use msgs::rcl_interfaces::{
 use serde_yaml_ng::Value;
 use tokio::sync::watch;
 
-use crate::parameters::{
-    InvalidParameter, Loaded, OF_EVERY_NODE, Parameters, Range, descriptions, from_values, shown,
+use crate::{
+    invalid_parameter::InvalidParameter,
+    parameters::{Loaded, OF_EVERY_NODE, Parameters, Range, descriptions, from_values, shown},
 };
 
 /// Dotted names and values.
@@ -406,6 +407,7 @@ mod tests {
             parameters: Example::default(),
             use_sim_time: true,
             autostart: true,
+            qos_overrides: Default::default(),
         };
         ParameterStore::new(&loaded, true).unwrap()
     }

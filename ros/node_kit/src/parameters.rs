@@ -5,7 +5,11 @@ use std::{collections::BTreeMap, fmt, fs, path::PathBuf};
 use serde::{Deserialize, Serialize, de::DeserializeOwned};
 use serde_yaml_ng::{Mapping, Value};
 
-use crate::arguments::ParameterSource;
+use crate::{
+    arguments::ParameterSource,
+    invalid_parameter::InvalidParameter,
+    qos_overrides::{self, QosOverrides},
+};
 
 /// The parameters of a node: a serde struct with `#[serde(default, deny_unknown_fields)]`, whose
 /// `Default` is what the node does without any.
@@ -109,26 +113,6 @@ impl fmt::Display for Range {
     }
 }
 
-/// A value that a node cannot work with.
-#[derive(Clone, Debug, PartialEq, thiserror::Error)]
-#[error("parameter {name}: {reason}")]
-pub struct InvalidParameter {
-    /// Dotted name.
-    pub name: String,
-    /// What was expected, and what was found.
-    pub reason: String,
-}
-
-impl InvalidParameter {
-    /// `name` is dotted; `reason` says what was expected and what was found.
-    pub fn new(name: impl Into<String>, reason: impl Into<String>) -> Self {
-        Self {
-            name: name.into(),
-            reason: reason.into(),
-        }
-    }
-}
-
 /// Why a node's parameters cannot be used.
 #[derive(Debug, thiserror::Error)]
 pub enum ParameterError {
@@ -179,6 +163,8 @@ pub struct Loaded<P> {
     pub use_sim_time: bool,
     /// The node configures and activates itself.
     pub autostart: bool,
+    /// What `qos_overrides` asks for.
+    pub qos_overrides: QosOverrides,
 }
 
 /// Reads the parameters of one node; later sources win, and `-p` wins over files (as in rcl).
@@ -338,6 +324,7 @@ impl Collected {
     fn finish<P: Parameters>(mut self) -> Result<Loaded<P>, ParameterError> {
         let use_sim_time = self.of_every_node("use_sim_time", false)?;
         let autostart = self.of_every_node("autostart", true)?;
+        let qos_overrides = self.qos_overrides()?;
         let tree = Value::Mapping(std::mem::take(&mut self.tree));
         let parameters: P = serde_path_to_error::deserialize(tree).map_err(|error| {
             let path = error.path().to_string();
@@ -350,6 +337,7 @@ impl Collected {
             parameters,
             use_sim_time,
             autostart,
+            qos_overrides,
         })
     }
 
@@ -359,6 +347,18 @@ impl Collected {
             Some(Value::Bool(on)) => Ok(on),
             Some(other) => Err(self.error(name, format!("expected a bool, found {other:?}"))),
         }
+    }
+
+    fn qos_overrides(&mut self) -> Result<QosOverrides, ParameterError> {
+        let read = match self.tree.remove(qos_overrides::PREFIX) {
+            None => return Ok(QosOverrides::default()),
+            Some(Value::Mapping(topics)) => QosOverrides::from_mapping(&topics),
+            Some(_) => Err(InvalidParameter::new(
+                qos_overrides::PREFIX,
+                "expected a mapping of topics",
+            )),
+        };
+        read.map_err(|invalid| self.error(&invalid.name, invalid.reason))
     }
 
     /// An error that says where the value came from.

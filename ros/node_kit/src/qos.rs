@@ -1,9 +1,19 @@
 //! The QoS profiles of the system; nothing bypasses them.
 
+use std::ops::RangeInclusive;
+
 use ros2_client::qos::{Durability, History, QosProfile, WhenFull};
 use rustdds::{QosPolicies, QosPolicyBuilder, policy};
 
-use crate::statistics::Direction;
+use crate::endpoint::Direction;
+
+/// What is asked for one endpoint; the profile's own where nothing is.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub(crate) struct QosOverride {
+    pub depth: Option<i64>,
+    pub reliable: Option<bool>,
+    pub transient_local: Option<bool>,
+}
 
 /// How a topic is delivered (REP-2003, and the design's choices).
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -25,11 +35,13 @@ impl Qos {
     /// As DDS policies. The resource limit bounds what RustDDS keeps of a topic: on the reader's
     /// side everything that has arrived, otherwise 64 samples (400 MB for six camera topics); on the
     /// writer's side what has not been acknowledged.
-    pub(crate) fn policies(self, direction: Direction) -> QosPolicies {
+    pub(crate) fn policies(self, direction: Direction, wish: QosOverride) -> QosPolicies {
         let limit = match direction {
             Direction::In => self.reader_limit(),
             Direction::Out => self.writer_limit(),
         };
+        let depth = wish.depth.map_or(self.depth(), |depth| depth as i32);
+        let limit = limit.max(depth);
         let infinite = rustdds::Duration::INFINITE;
         let builder = QosPolicyBuilder::new()
             .deadline(policy::Deadline(infinite))
@@ -37,22 +49,18 @@ impl Qos {
             .liveliness(policy::Liveliness::Automatic {
                 lease_duration: infinite,
             });
-        let builder = match self {
-            Self::Image => builder.best_effort(),
+        let builder = match wish.reliable.unwrap_or(self != Self::Image) {
+            false => builder.best_effort(),
             // A publisher waits this long for readers that do not keep up, then the sample is
             // counted as dropped.
-            Self::Latched | Self::Event | Self::Service => {
-                builder.reliable(rustdds::Duration::from_millis(100))
-            }
+            true => builder.reliable(rustdds::Duration::from_millis(100)),
         };
         builder
             .durability(match self {
                 Self::Latched => policy::Durability::TransientLocal,
                 _ => policy::Durability::Volatile,
             })
-            .history(policy::History::KeepLast {
-                depth: self.depth(),
-            })
+            .history(policy::History::KeepLast { depth })
             .resource_limits(policy::ResourceLimits {
                 max_samples: limit,
                 max_instances: 1,
@@ -72,6 +80,16 @@ impl Qos {
             .history(History::KeepLast {
                 depth: self.depth() as usize,
             })
+    }
+
+    /// Depths that may be asked for instead of the profile's own. A latched topic has one newest message; what happens once must not
+    /// push out what has not been acknowledged, and ROS's own default is 10.
+    pub(crate) fn depths(self) -> RangeInclusive<i64> {
+        match self {
+            Self::Image => 1..=64,
+            Self::Latched => 1..=1,
+            Self::Event | Self::Service => 10..=4096,
+        }
     }
 
     const fn depth(self) -> i32 {
@@ -106,16 +124,32 @@ mod tests {
     #[test]
     fn only_latched_topics_are_replayed_to_late_joiners() {
         for qos in [Qos::Image, Qos::Event, Qos::Service] {
-            assert!(qos.policies(Direction::Out).is_volatile(), "{qos:?}");
+            assert!(
+                qos.policies(Direction::Out, QosOverride::default())
+                    .is_volatile(),
+                "{qos:?}"
+            );
         }
-        assert!(!Qos::Latched.policies(Direction::Out).is_volatile());
+        assert!(
+            !Qos::Latched
+                .policies(Direction::Out, QosOverride::default())
+                .is_volatile()
+        );
     }
 
     #[test]
     fn only_images_are_best_effort() {
-        assert!(!Qos::Image.policies(Direction::Out).is_reliable());
+        assert!(
+            !Qos::Image
+                .policies(Direction::Out, QosOverride::default())
+                .is_reliable()
+        );
         for qos in [Qos::Latched, Qos::Event, Qos::Service] {
-            assert!(qos.policies(Direction::Out).is_reliable(), "{qos:?}");
+            assert!(
+                qos.policies(Direction::Out, QosOverride::default())
+                    .is_reliable(),
+                "{qos:?}"
+            );
         }
     }
 }

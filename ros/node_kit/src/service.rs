@@ -70,6 +70,20 @@ pub enum CallError {
     },
 }
 
+impl CallError {
+    /// `Ok` where a server was discovered in time.
+    pub(crate) fn unless_discovered(
+        discovered: bool,
+        name: &str,
+        waited: Duration,
+    ) -> Result<(), Self> {
+        discovered.then_some(()).ok_or_else(|| Self::Unavailable {
+            name: name.to_owned(),
+            waited,
+        })
+    }
+}
+
 /// Tries a call several times; each attempt has its own request id, and an answer to any earlier
 /// one is ignored.
 pub(crate) async fn attempt<T, F>(
@@ -123,7 +137,8 @@ impl<S: Service> ServiceClient<S> {
 
     /// Waits until a server is discovered.
     pub async fn wait_for_server(&self, limit: Duration) -> Result<(), CallError> {
-        self.graph.wait_for_service(&self.name, limit).await
+        let discovered = self.graph.wait_for_service(&self.name, limit).await;
+        CallError::unless_discovered(discovered, &self.name, limit)
     }
 
     /// Sends the request, again if no reply comes.

@@ -11,17 +11,10 @@ use std::{
 
 use tracing::warn;
 
-use crate::graph::Endpoint;
+use crate::endpoint::{Direction, Endpoint};
 
 /// At most one warning per period and topic, so that a flood of bad messages floods no log.
 const WARNING_PERIOD: Duration = Duration::from_secs(1);
-
-/// Whether a node sends or receives.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(crate) enum Direction {
-    In,
-    Out,
-}
 
 /// Counters of one topic or service endpoint.
 #[derive(Debug)]
@@ -109,6 +102,11 @@ impl Statistics {
 
     pub(crate) fn count_dropped(&self, count: u64) {
         self.dropped.fetch_add(count, Relaxed);
+    }
+
+    /// Absolute name of the topic or service.
+    pub fn name(&self) -> &str {
+        &self.name
     }
 
     /// Counts a message that cannot be used, and warns, at most once a second, naming the topic.

@@ -2,6 +2,7 @@ use std::{
   collections::HashMap,
   io,
   net::{IpAddr, Ipv4Addr, SocketAddr},
+  sync::Once,
 };
 
 use log::{debug, error, info, trace, warn};
@@ -70,7 +71,46 @@ impl Drop for UDPListener {
   }
 }
 
+/// Three RGB-D cameras send 6.5 MB at once; with less than this the kernel drops
+/// a part of it whenever the event loop has no processor for a moment.
+const NEEDED_RECEIVE_BUFFER: usize = 4 * 1024 * 1024;
+
+/// Told once per process: every participant has four sockets.
+static TOLD_OF_SMALL_BUFFER: Once = Once::new();
+
 impl UDPListener {
+  /// Asks for a receive buffer, above `net.core.rmem_max` where the process may
+  /// (CAP_NET_ADMIN), and tells what the kernel grants where that is too little.
+  fn enlarge_receive_buffer(raw_socket: &Socket, wanted: usize) {
+    #[cfg(target_os = "linux")]
+    let forced =
+      nix::sys::socket::setsockopt(raw_socket, nix::sys::socket::sockopt::RcvBufForce, &wanted)
+        .is_ok();
+    #[cfg(not(target_os = "linux"))]
+    let forced = false;
+    if !forced {
+      if let Err(e) = raw_socket.set_recv_buffer_size(wanted) {
+        debug!("Failed to set SO_RCVBUF to {wanted}: {e}. Using OS default.");
+      }
+    }
+    // Linux reports twice what it grants, for its own bookkeeping.
+    let factor = if cfg!(target_os = "linux") { 2 } else { 1 };
+    match raw_socket.recv_buffer_size() {
+      Ok(effective) if effective / factor < NEEDED_RECEIVE_BUFFER.min(wanted) => {
+        TOLD_OF_SMALL_BUFFER.call_once(|| {
+          warn!(
+            target: "rustdds::receive_buffer",
+            "the kernel grants a receive buffer of {} bytes, expected {NEEDED_RECEIVE_BUFFER}: images may be lost; \
+             sysctl net.core.rmem_max={NEEDED_RECEIVE_BUFFER} allows it (macOS: kern.ipc.maxsockbuf)",
+            effective / factor
+          );
+        });
+      }
+      Ok(effective) => debug!("SO_RCVBUF requested {wanted} bytes, effective {effective} bytes."),
+      Err(e) => debug!("Could not read back SO_RCVBUF: {e}"),
+    }
+  }
+
   fn new_listening_socket(
     host: &str,
     port: u16,
@@ -80,35 +120,7 @@ impl UDPListener {
     let raw_socket = Socket::new(Domain::IPV4, Type::DGRAM, Some(Protocol::UDP))?;
 
     if recv_buffer_size > 0 {
-      raw_socket
-        .set_recv_buffer_size(recv_buffer_size)
-        .unwrap_or_else(|e| {
-          warn!("Failed to set SO_RCVBUF to {recv_buffer_size}: {e}. Using OS default.");
-        });
-
-      // Verify the effective size (getsockopt). The kernel silently clamps
-      // SO_RCVBUF to a per-socket ceiling (macOS: `kern.ipc.maxsockbuf`, which
-      // defaults to 8 MiB; Linux: `net.core.rmem_max`). Note Linux reports back
-      // ~2x the requested value (bookkeeping overhead). Warn only when the
-      // effective size is materially below what we asked for, so silent clamping
-      // that can cause packet loss under load is visible in the logs.
-      match raw_socket.recv_buffer_size() {
-        Ok(effective) => {
-          if effective < recv_buffer_size {
-            warn!(
-              "SO_RCVBUF clamped: requested {recv_buffer_size} bytes but got {effective} bytes. \
-               The kernel limits per-socket receive buffers; raise it to reduce packet loss under \
-               load (macOS: `sudo sysctl -w kern.ipc.maxsockbuf=<bytes>`, Linux: `sudo sysctl -w \
-               net.core.rmem_max=<bytes>`)."
-            );
-          } else {
-            debug!("SO_RCVBUF requested {recv_buffer_size} bytes, effective {effective} bytes.");
-          }
-        }
-        Err(e) => {
-          debug!("Could not read back SO_RCVBUF: {e}");
-        }
-      }
+      Self::enlarge_receive_buffer(&raw_socket, recv_buffer_size);
     }
 
     // We set ReuseAddr so that other DomainParticipants on this host can

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import math
+import time
 
 import numpy as np
 import pytest
@@ -80,6 +81,28 @@ def test_depth_in_millimetres_gives_the_same_heights(cameras, operator_for_modul
 
     heightmap = fused(operator_for_module, cameras, in_millimetres)
     assert np.abs(heights(heightmap)[155:165, 75:85] - BOX_HEIGHT_M).max() < TOLERANCE_M
+
+
+def as_mono16(view: View) -> None:
+    view.depth.encoding = "mono16"
+    set_depth(view, np.round(depth_pixels(view) * 1000).astype(np.uint16))
+
+
+def half_size(view: View) -> None:
+    small = np.ascontiguousarray(depth_pixels(view)[::2, ::2])
+    view.depth = image(view.depth.header, "32FC1", 2 * WIDTH, small)
+    view.depth.height, view.depth.width = HEIGHT // 2, WIDTH // 2
+
+
+def inverse_brown_conrady(view: View) -> None:
+    view.info.distortion_model = "inverse_brown_conrady"
+
+
+@pytest.mark.parametrize("change", [as_mono16, half_size, inverse_brown_conrady])
+def test_what_drivers_of_depth_cameras_send_gives_the_same_heights(cameras, operator_for_module, change: Change) -> None:
+    heightmap = fused(operator_for_module, cameras, change, None)
+    assert np.abs(heights(heightmap)[155:165, 75:85] - BOX_HEIGHT_M).max() < TOLERANCE_M
+    assert (np.abs(heights(heightmap)) > TOLERANCE_M).sum() < 1.2 * (40 * 40 * (1 / 450 / 0.003125) ** 2)
 
 
 @pytest.mark.parametrize("hole", [math.nan, 0.0, -1.0, math.inf])
@@ -268,6 +291,46 @@ def test_without_extrinsics_nothing_is_fused_and_the_camera_is_named(start) -> N
         assert all(made.views < 3 for made in operator.received["heightmap"])
         cameras.publish_extrinsics()
         assert fused(operator, cameras).views == 3
+
+
+def test_transforms_that_come_some_seconds_after_the_images_are_waited_for_without_a_word(start) -> None:
+    other = free_domain()
+    fusion = start("camera_fusion", domain=other)
+    with Operator(other) as operator:
+        cameras = Cameras(operator)
+        cameras.wait_for_fusion()
+        for _ in range(10):
+            cameras.publish()
+            operator.spin(0.2)
+        assert not operator.received["heightmap"]
+        cameras.publish_extrinsics()
+        assert fused(operator, cameras).views == 3
+        operator.until(lambda: operator.diagnosed("camera_fusion: topics"), "diagnostics", 60.0)
+        said = operator.diagnosed("camera_fusion: topics")
+        counted = [said[f"/{name}/color/image_raw"] for name in ("front", "left", "right")]
+        assert all("errors=0" in line for line in counted), counted
+        assert "optical_frame" not in fusion.errors()
+
+
+def test_the_standard_qos_overrides_are_accepted_and_those_that_break_the_protocol_refused_by_name(start, tmp_path) -> None:
+    file = tmp_path / "cell.yaml"
+
+    def start_with(overrides: str) -> Process:
+        file.write_text(f"/**:\n  ros__parameters:\n    qos_overrides: {{{overrides}}}\n")
+        return start("camera_fusion", "--ros-args", "--params-file", file, domain=free_domain())
+
+    accepted = start_with("/parameter_events: {publisher: {depth: 10, history: keep_last}}")
+    deadline = time.monotonic() + 60.0
+    while "active" not in accepted.errors().split("activating")[-1]:
+        assert accepted.exit_code is None and time.monotonic() < deadline, accepted.log()
+        time.sleep(0.1)
+    for overrides, name in [
+        ("/heightmap: {publisher: {reliability: best_effort}}", "qos_overrides./heightmap.publisher.reliability"),
+        ("/heightmap: {publisher: {depht: 3}}", "qos_overrides./heightmap.publisher.depht"),
+    ]:
+        refused = start_with(overrides)
+        assert refused.wait(60.0) != 0
+        assert name in refused.errors()
 
 
 def test_a_camera_that_stops_and_comes_back_is_in_the_diagnostics_and_others_go_on_where_asked_to(start) -> None:

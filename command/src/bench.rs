@@ -9,7 +9,7 @@ use cpu_time::ThreadTime;
 use criterion::Criterion;
 use gctn::{Device, NetworkConfig, Policy, Precision, Trainer, TrainingConfig};
 use heightmap::{Fusion, Heightmap, View, Workspace};
-use learning::{DataSet, Sampling, demonstrate};
+use learning::{DataSet, DrawRules, Sampling, Shown, demonstrate, goal};
 use multiravens::{Environment, Problem};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
@@ -87,6 +87,13 @@ const WORKLOADS: &[Workload] = &[
         run: decision_compact,
     },
     Workload {
+        name: "decision_matching",
+        threads: 1,
+        original_s: Some(5.26),
+        samples: 20,
+        run: decision_matching,
+    },
+    Workload {
         name: "decision_resnet43",
         threads: 2,
         original_s: Some(5.26),
@@ -106,6 +113,13 @@ const WORKLOADS: &[Workload] = &[
         original_s: Some(27.4),
         samples: 20,
         run: training_sample_compact,
+    },
+    Workload {
+        name: "training_sample_matching",
+        threads: 1,
+        original_s: Some(27.4),
+        samples: 20,
+        run: training_sample_matching,
     },
     Workload {
         name: "training_step_resnet43",
@@ -394,6 +408,12 @@ fn decision_compact(root: &Root, criterion: &mut Criterion, name: &str) -> Resul
     )
 }
 
+/// Random weights cost as much as trained ones.
+fn decision_matching(root: &Root, criterion: &mut Criterion, name: &str) -> Result<()> {
+    let trainer = Trainer::new(&NetworkConfig::matching(), &TrainingConfig::compact())?;
+    decision(root, criterion, name, &trainer.policy()?)
+}
+
 fn decision_resnet43(root: &Root, criterion: &mut Criterion, name: &str) -> Result<()> {
     decision(root, criterion, name, &resnet43(Precision::F32)?.policy()?)
 }
@@ -423,6 +443,17 @@ fn training_sample_compact(root: &Root, criterion: &mut Criterion, name: &str) -
     training_step(root, criterion, name, trainer)
 }
 
+/// The same of the network that follows a demonstration from another start.
+fn training_sample_matching(root: &Root, criterion: &mut Criterion, name: &str) -> Result<()> {
+    let training = TrainingConfig {
+        batch: 1,
+        precision: Precision::Bf16,
+        ..TrainingConfig::compact()
+    };
+    let trainer = Trainer::new(&NetworkConfig::matching(), &training)?;
+    training_step(root, criterion, name, trainer)
+}
+
 /// As published: one sample a step, over all rotations.
 fn training_step_resnet43(root: &Root, criterion: &mut Criterion, name: &str) -> Result<()> {
     training_step(root, criterion, name, resnet43(Precision::F32)?)
@@ -442,7 +473,14 @@ fn training_step(
     )?)?;
     let mut rng = ChaCha8Rng::seed_from_u64(SEED);
     let conditioning = trainer.network().conditioning;
-    let sample = data.draw(&Sampling::Plain, conditioning, 0.0, &mut rng)?;
+    let rules = DrawRules {
+        sampling: &Sampling::Plain,
+        conditioning,
+        goal_jitter: 0.0,
+        shown: Shown::default(),
+    };
+    let drawn = data.draw(&rules, &mut rng)?;
+    let sample = drawn.sample();
     trainer.train_step(&[sample])?;
     let mut failure = None;
     criterion.bench_function(name, |b| {
@@ -457,10 +495,8 @@ fn training_step(
 
 fn decision(root: &Root, criterion: &mut Criterion, name: &str, policy: &Policy) -> Result<()> {
     let shown = demonstration(&root.problem("placing")?, &root.work_cell()?, SEED)?;
-    let goal = shown
-        .goals()
-        .into_iter()
-        .next()
+    let conditioning = policy.config().conditioning;
+    let goal = goal(shown.observation(0), &shown.goals(), 0, conditioning)
         .context("a demonstration without goals")?;
     let observation = &shown
         .steps

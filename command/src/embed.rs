@@ -5,6 +5,7 @@ use crate::root::Root;
 use anyhow::{Context, Result};
 use clap::Args;
 use gctn::{EmbeddingTrainer, ModelCard};
+use heightmap::Heightmap;
 use learning::{DataSet, EmbeddingRecipe};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
@@ -33,7 +34,7 @@ impl Embed {
         let mut data = DataSet::default();
         for problem in &recipe.problems {
             root.problem(problem)?;
-            data.load(&self.demos, problem, recipe.demonstrations)?;
+            data.load(&self.demos, problem, recipe.demonstrations, false)?;
         }
         let training = &recipe.training;
         let mut trainer = EmbeddingTrainer::new(&recipe.network, training)?;
@@ -43,6 +44,10 @@ impl Embed {
         while trainer.step() < training.steps {
             let sequences = (0..training.batch).map(|_| data.draw_images(&mut rng));
             let sequences = sequences.collect::<Result<Vec<_>, _>>()?;
+            let sequences = sequences
+                .iter()
+                .map(|images| images.iter().map(AsRef::as_ref));
+            let sequences: Vec<Vec<&Heightmap>> = sequences.map(Iterator::collect).collect();
             let step = trainer.train_step(&sequences)?;
             loss += step.loss / LOG_EVERY as f64;
             right += step.right / LOG_EVERY as f64;

@@ -3,13 +3,14 @@
 use crate::picture::scores;
 use crate::progress;
 use crate::root::Root;
-use anyhow::{Context, Result};
-use clap::Args;
+use anyhow::{Context, Result, bail};
+use clap::{Args, ValueEnum};
 use gctn::Policy;
 use heightmap::picture::{self, RgbImage};
-use learning::{Attempt, Evaluation, NextStepOracle, evaluate, goal};
+use learning::{Actor, Attempt, Episodes, Evaluation, NextStepOracle, Start, evaluate, goal};
 use std::path::PathBuf;
 use std::sync::Mutex;
+use step_protocol::FAILED_PICK_RADIUS_M;
 
 /// Arguments of `sctn evaluate`.
 #[derive(Args)]
@@ -20,6 +21,12 @@ pub struct Evaluate {
     /// Problem to solve
     #[arg(long)]
     problem: String,
+    /// Act by a rule that has learned nothing instead of a policy: what a score is worth that does not beat it
+    #[arg(long, value_enum, conflicts_with_all = ["checkpoint", "failures"])]
+    baseline: Option<Baseline>,
+    /// Start of the demonstration that is shown: the very start of the episode, or another one of its scene
+    #[arg(long, value_enum, default_value = "same")]
+    start: StartArgument,
     /// Number of episodes
     #[arg(long)]
     episodes: usize,
@@ -41,6 +48,31 @@ pub struct Evaluate {
     json: bool,
 }
 
+/// Rules without anything learned.
+#[derive(Clone, Copy, Debug, ValueEnum)]
+enum Baseline {
+    /// Pick the middle of the cells that are lower in the goal by more than 6 mm, place at the middle of those that are higher
+    Difference,
+}
+
+/// Where the shown demonstration begins.
+#[derive(Clone, Copy, Debug, ValueEnum)]
+enum StartArgument {
+    /// At the very start of the episode
+    Same,
+    /// At another start of the same scene: start seed SEED + 1
+    Other,
+}
+
+impl From<StartArgument> for Start {
+    fn from(start: StartArgument) -> Self {
+        match start {
+            StartArgument::Same => Self::Same,
+            StartArgument::Other => Self::Other,
+        }
+    }
+}
+
 impl Evaluate {
     pub fn run(self, root: &Root) -> Result<()> {
         let problem = root.problem(&self.problem)?;
@@ -49,17 +81,26 @@ impl Evaluate {
         let cores = std::thread::available_parallelism().map_or(1, |cores| cores.get());
         // One decision on one thread, several episodes at a time: the same bits whatever the machine.
         gctn::set_threads(1);
-        let mut policies: Vec<_> = (0..self.threads.unwrap_or(cores).max(1))
-            .map(|_| Ok(Policy::load(&checkpoint)?))
+        let mut actors: Vec<_> = (0..self.threads.unwrap_or(cores).max(1))
+            .map(|_| match self.baseline {
+                Some(Baseline::Difference) => Ok(Actor::Difference),
+                None => Ok(Actor::from(
+                    Policy::load(&checkpoint)?.with_exclusion_radius_m(FAILED_PICK_RADIUS_M),
+                )),
+            })
             .collect::<Result<_>>()?;
+        let plan = Episodes {
+            first_seed: self.seed,
+            count: self.episodes,
+            start: self.start.into(),
+        };
         let bar = progress::bar(self.episodes as u64, "episodes");
         let failed = Mutex::new(Vec::new());
         let report = evaluate(
             &problem,
             &work_cell,
-            &mut policies,
-            self.seed,
-            self.episodes,
+            &mut actors,
+            &plan,
             |report, attempt| {
                 bar.inc(1);
                 if self.failures.is_some() && !report.completed {
@@ -75,7 +116,9 @@ impl Evaluate {
             for attempt in failed {
                 let seed = attempt.shown.seed;
                 let path = folder.join(format!("{}_{seed}.png", self.problem));
-                let policy = policies.first().context("no policy")?;
+                let Some(Actor::Policy(policy)) = actors.first() else {
+                    bail!("--failures: only of a policy");
+                };
                 picture::write(&path, &drawn(policy, &attempt)?)?;
             }
         }
@@ -92,7 +135,7 @@ impl Evaluate {
     }
 }
 
-/// Each step of an attempt a row: observation, goal, pick scores, place scores.
+/// Each step of an attempt a row: observation, of a sequence the image before the goal, goal, pick scores, place scores.
 fn drawn(policy: &Policy, attempt: &Attempt) -> Result<RgbImage> {
     let goals = attempt.shown.goals();
     let done = &attempt.rollout.demonstration;
@@ -100,13 +143,16 @@ fn drawn(policy: &Policy, attempt: &Attempt) -> Result<RgbImage> {
     let mut rows = Vec::new();
     for (index, step) in done.steps.iter().enumerate() {
         let observation = done.observation(index);
-        let goal = goal(&goals, oracle.index(), policy.config().conditioning);
+        let first = attempt.shown.observation(0);
+        let goal = goal(first, &goals, oracle.index(), policy.config().conditioning);
         let goal = goal.context("a demonstration without a goal")?;
-        let row = picture::side_by_side(&[
-            picture::colors(observation),
+        let mut images = vec![picture::colors(observation)];
+        images.extend(goal.previous.map(picture::colors));
+        images.extend([
             picture::colors(goal.image),
             scores(policy, observation, goal)?,
         ]);
+        let row = picture::side_by_side(&images);
         rows.push(picture::halved(&row));
         oracle.observe(step.delta_reward);
     }

@@ -6,7 +6,7 @@ use anyhow::{Context, Result};
 use clap::Args;
 use gctn::{Embedding, Policy};
 use heightmap::Heightmap;
-use learning::{attempt, known_images, reached, wilson_95};
+use learning::{Actor, Start, attempt, known_images, reached, wilson_95};
 use multiravens::Environment;
 use rand::{Rng, RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -77,7 +77,7 @@ impl Goals {
         let checkpoint = self.checkpoint.unwrap_or_else(|| root.shipped_checkpoint());
         let embedding = self.embedding.unwrap_or_else(|| root.shipped_embedding());
         gctn::set_threads(1);
-        let policy = Policy::load(&checkpoint)?;
+        let actor = Actor::from(Policy::load(&checkpoint)?);
         let embedding = Embedding::load(&embedding)?;
         let mut environment = Environment::new(&problem, &root.work_cell()?);
         let mut report = Report {
@@ -92,7 +92,7 @@ impl Goals {
         let mut seed = self.seed;
         while report.policy.episodes < self.episodes {
             // A seed that the demonstrator fails on has no sequence.
-            if let Some(attempt) = attempt(&mut environment, &policy, seed)? {
+            if let Some(attempt) = attempt(&mut environment, &actor, seed, Start::Same)? {
                 let shown = &attempt.shown;
                 let known = known_images(shown);
                 let rollout = &attempt.rollout.demonstration;

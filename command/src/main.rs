@@ -17,6 +17,7 @@ mod latency;
 mod launch;
 mod picture;
 mod progress;
+mod reliability;
 mod root;
 mod search;
 mod sweep;
@@ -64,6 +65,8 @@ enum Command {
     Goals(goals::Goals),
     /// Evaluate a policy on held-out episodes
     Evaluate(evaluate::Evaluate),
+    /// Say whether a policy's probabilities of success are to be trusted, and fit them
+    Reliability(reliability::ReliabilityCommand),
     /// Launch the graph on a simulated cell, under an operator
     Launch(launch::Launch),
     /// Serve the operator's page for a graph that runs, simulated or real
@@ -79,6 +82,7 @@ fn main() -> Result<ExitCode> {
     match arguments.command {
         // Bags can be looked at anywhere.
         Command::Bag(bag) => return bag.run(),
+        Command::Reliability(reliability) => reliability.run(),
         Command::Bench(bench) => bench.run(&root()?),
         Command::Demos(demos) => demos.run(&root()?),
         Command::Health(health) => health.run(&root()?),

@@ -7,6 +7,7 @@ use clap::Args;
 use gctn::{Goal, Policy, ScoreMap};
 use heightmap::Heightmap;
 use heightmap::picture::{self, RgbImage};
+use learning::goal;
 use multiravens::Environment;
 use std::path::PathBuf;
 
@@ -59,8 +60,8 @@ impl Picture {
             .iter()
             .filter(|step| step.delta_reward > 0.0)
             .count();
-        let goal = shown
-            .goals()
+        let goals = shown.goals();
+        let image = goals
             .get(earned)
             .copied()
             .context("no reward follows this step: there is no goal")?;
@@ -68,14 +69,14 @@ impl Picture {
             picture::side_by_side(&[picture::colors(heightmap), picture::heights(heightmap)])
         };
         write("heightmap.png", &both(&step.observation))?;
-        write("goal.png", &both(goal))?;
+        write("goal.png", &both(image))?;
         let checkpoint = self.checkpoint.unwrap_or_else(|| root.shipped_checkpoint());
         gctn::set_threads(1);
         let policy = Policy::load(&checkpoint)?;
-        write(
-            "scores.png",
-            &scores(&policy, &step.observation, goal.into())?,
-        )
+        let conditioning = policy.config().conditioning;
+        let goal = goal(shown.observation(0), &goals, earned, conditioning);
+        let goal = goal.context("a demonstration without a goal")?;
+        write("scores.png", &scores(&policy, &step.observation, goal)?)
     }
 }
 

@@ -7,7 +7,10 @@ use anyhow::{Context, Result};
 use clap::Args;
 use cpu_time::ProcessTime;
 use gctn::{Device, Policy, TrainingConfig};
-use learning::{Recipe, Run, RunResult, Score, SnapshotResult, Sweep, evaluate, wilson_95};
+use learning::{
+    Actor, Episodes, Recipe, Run, RunResult, Score, SnapshotResult, Start, Sweep, evaluate,
+    wilson_95,
+};
 use std::path::{Path, PathBuf};
 
 /// Arguments of `sctn sweep`.
@@ -94,18 +97,17 @@ impl SweepCommand {
         let problem = root.problem(&run.problem)?;
         let work_cell = root.work_cell()?;
         let score = |snapshot: &Snapshot, seed: u64, episodes: usize| -> Result<Score> {
-            let mut policies = (0..recipe.training.threads)
-                .map(|_| Policy::load(&snapshot.checkpoint))
-                .collect::<Result<Vec<_>, _>>()?;
+            gctn::set_threads(1);
+            let mut actors = (0..recipe.training.threads)
+                .map(|_| Ok(Actor::from(Policy::load(&snapshot.checkpoint)?)))
+                .collect::<Result<Vec<_>>>()?;
+            let plan = Episodes {
+                first_seed: seed,
+                count: episodes,
+                start: Start::Same,
+            };
             let bar = progress::bar(episodes as u64, "episodes");
-            let report = evaluate(
-                &problem,
-                &work_cell,
-                &mut policies,
-                seed,
-                episodes,
-                |_, _| bar.inc(1),
-            )?;
+            let report = evaluate(&problem, &work_cell, &mut actors, &plan, |_, _| bar.inc(1))?;
             bar.finish_and_clear();
             Ok(Score {
                 episodes: report.episodes,

@@ -6,9 +6,11 @@ use crate::root::Root;
 use anyhow::{Context, Result, bail};
 use bags::Demonstration;
 use clap::Args;
-use gctn::{ModelCard, Policy};
+use gctn::{GoalConditioning, ModelCard, Policy};
 use indicatif::HumanDuration;
-use learning::{DataSet, EventFile, Recipe, Training, evaluate, recorded_run};
+use learning::{
+    Actor, DataSet, Episodes, EventFile, Recipe, Start, Training, evaluate, recorded_run,
+};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::io::Write;
@@ -91,14 +93,15 @@ impl Train {
 
 /// The demonstrations of one folder that `sctn demos` wrote, or of recorded runs.
 fn load(demos: &[PathBuf], recipe: &mut Recipe) -> Result<DataSet> {
-    let mut data = DataSet::default();
+    let mut data = DataSet::new(recipe.decoded_mb);
     let runs: Vec<PathBuf> = demos.iter().filter_map(|path| recorded_run(path)).collect();
     if runs.is_empty() {
         let [folder] = demos else {
             bail!("--demos: expected one folder of demonstrations, or recorded runs only");
         };
         for problem in &recipe.problems {
-            data.load(folder, problem, recipe.demonstrations)?;
+            let starts = recipe.network.conditioning == GoalConditioning::Sequence;
+            data.load(folder, problem, recipe.demonstrations, starts)?;
         }
         return Ok(data);
     }
@@ -137,8 +140,13 @@ pub fn train(
     resume: bool,
 ) -> Result<Vec<Snapshot>> {
     let data = load(demos, &mut recipe)?;
-    tracing::info!("{} demonstrations, {} steps", data.len(), data.step_count());
-    gctn::set_threads(recipe.training.threads);
+    tracing::info!(
+        "{} demonstrations of {} scenes, {} steps, {:.0} MB of images",
+        data.len(),
+        data.scene_count(),
+        data.step_count(),
+        data.image_bytes() as f64 / 1e6
+    );
     let asked = recipe.training.precision;
     let precision = asked.on(recipe.training.device);
     if precision != asked {
@@ -169,6 +177,7 @@ pub fn train(
             let scalars = [
                 ("loss/pick", losses.pick),
                 ("loss/place", losses.place),
+                ("loss/done", losses.done),
                 ("gradient_norm", losses.gradient_norm),
                 ("learning_rate", learning_rate),
             ];
@@ -178,8 +187,12 @@ pub fn train(
         }
         // Where there is no terminal to draw a bar on, a line now and then.
         if bar.is_hidden() && training.step().is_multiple_of(LOG_EVERY) {
+            let done = match losses.done > 0.0 {
+                true => format!(", done loss {:.3}", losses.done),
+                false => String::new(),
+            };
             tracing::info!(
-                "step {}: {}, {} left",
+                "step {}: {}{done}, {} left",
                 training.step(),
                 bar.message(),
                 HumanDuration(bar.eta())
@@ -234,23 +247,30 @@ fn validate(root: &Root, recipe: &Recipe, snapshot: &mut Snapshot) -> Result<()>
         return Ok(());
     }
     let work_cell = root.work_cell()?;
-    let mut policies: Vec<_> = (0..recipe.training.threads.max(1))
-        .map(|_| Ok(Policy::load(&snapshot.checkpoint)?))
+    // One episode on one thread: `training.threads` of libtorch for each of as many episodes would be their square.
+    gctn::set_threads(1);
+    let mut actors: Vec<_> = (0..recipe.training.threads)
+        .map(|_| Ok(Actor::from(Policy::load(&snapshot.checkpoint)?)))
         .collect::<Result<_>>()?;
+    let start = match recipe.network.conditioning {
+        GoalConditioning::Sequence => Start::Other,
+        GoalConditioning::NextStep | GoalConditioning::Final | GoalConditioning::Both => {
+            Start::Same
+        }
+    };
+    let plan = Episodes {
+        first_seed: recipe.validation.seed,
+        count: recipe.validation.episodes,
+        start,
+    };
     for name in &recipe.problems {
         let problem = root.problem(name)?;
-        let report = evaluate(
-            &problem,
-            &work_cell,
-            &mut policies,
-            recipe.validation.seed,
-            recipe.validation.episodes,
-            |_, _| (),
-        )?;
+        let report = evaluate(&problem, &work_cell, &mut actors, &plan, |_, _| ())?;
         tracing::info!("step {}: {}", snapshot.step, summary(&report));
         snapshot.completion.insert(name.clone(), report.completion);
         snapshot.reward.insert(name.clone(), report.reward);
     }
+    gctn::set_threads(recipe.training.threads);
     Ok(())
 }
 

@@ -1,36 +1,114 @@
 //! Demonstrations as training samples.
 
-use crate::goal::known_images;
+use crate::images::{ImageId, ImageStore};
 use crate::sampling::{Sampling, SamplingError};
 use bags::{Demonstration, DemonstrationError};
 use gctn::{Goal, GoalConditioning, Sample};
 use heightmap::Heightmap;
 use multiravens::EpisodeSeed;
+use pick_place::PickPlace;
 use rand::{Rng, RngExt};
+use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 
-/// Demonstrations in memory, and which of their steps can be learned from.
-#[derive(Debug, Default)]
+/// Demonstrations in memory, their images compressed, and which of their steps can be learned from.
+#[derive(Debug)]
 pub struct DataSet {
     demonstrations: Vec<Indexed>,
+    images: ImageStore,
+    /// Demonstrations of the same problem and scene, by their indices.
+    scenes: BTreeMap<(String, u64), Vec<usize>>,
+}
+
+impl Default for DataSet {
+    /// Keeps 512 MB of decoded images.
+    fn default() -> Self {
+        Self::new(512)
+    }
 }
 
 #[derive(Debug)]
 struct Indexed {
-    demonstration: Demonstration,
+    scene: (String, u64),
+    /// The observations, that after the last step included.
+    observations: Vec<ImageId>,
+    actions: Vec<PickPlace>,
     /// Steps that lead to a delta reward, now or later.
     steps: Vec<Step>,
     /// Module of each such step.
     modules: Vec<String>,
+    /// Indices of the observations after a positive delta reward: the demonstration's sequence.
+    goals: Vec<usize>,
 }
 
 #[derive(Clone, Copy, Debug)]
 struct Step {
     index: usize,
-    /// Index of the observation after the first positive delta reward from this step on.
-    next_goal: usize,
-    /// Index of the observation after the second one; the same where there is none.
-    goal_after: usize,
+    /// Number, in the sequence, of the observation after the first positive delta reward from this step on.
+    goal: usize,
+}
+
+/// What of a scene's demonstrations a sample of the conditioning `sequence` shows.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Shown {
+    /// Share of samples that are shown the very demonstration that they are of; the others are shown one of
+    /// another start of the same scene, where there is one.
+    pub same_start: f64,
+    /// Share of samples whose step is done already: what is seen is the state after it, or a later one.
+    pub done: f64,
+}
+
+impl Default for Shown {
+    fn default() -> Self {
+        Self {
+            same_start: 0.15,
+            done: 0.0,
+        }
+    }
+}
+
+/// How samples are drawn.
+#[derive(Clone, Copy, Debug)]
+pub struct DrawRules<'a> {
+    /// Which step is drawn how often.
+    pub sampling: &'a Sampling,
+    /// What a sample shows as its goal.
+    pub conditioning: GoalConditioning,
+    /// Probability that a next-step goal is the one after the next. Not with the conditioning `sequence`.
+    pub goal_jitter: f64,
+    /// For the conditioning `sequence`.
+    pub shown: Shown,
+}
+
+/// A drawn sample with its images.
+#[derive(Clone, Debug)]
+pub struct DrawnSample {
+    observation: Arc<Heightmap>,
+    image: Arc<Heightmap>,
+    last: Option<Arc<Heightmap>>,
+    previous: Option<Arc<Heightmap>>,
+    action: PickPlace,
+    done: bool,
+}
+
+impl DrawnSample {
+    /// What a trainer takes.
+    pub fn sample(&self) -> Sample<'_> {
+        Sample {
+            observation: &self.observation,
+            goal: Goal {
+                image: &self.image,
+                last: self.last.as_deref(),
+                previous: self.previous.as_deref(),
+            },
+            pick: self.action.pick,
+            place: self.action.place,
+            done: self.done,
+        }
+    }
 }
 
 /// Why demonstrations cannot be learned from.
@@ -49,11 +127,14 @@ pub enum DataSetError {
     TooFew {
         /// The folder.
         path: PathBuf,
-        /// Demonstrations found.
+        /// Demonstrations found, each scene counted once.
         found: usize,
         /// Demonstrations asked for.
         expected: usize,
     },
+    /// An image cannot be compressed, or not be decoded again.
+    #[error("an image of the data set: {0}")]
+    Image(std::io::Error),
     /// A demonstration that is none.
     #[error(transparent)]
     Demonstration(#[from] DemonstrationError),
@@ -106,41 +187,58 @@ pub fn recorded_run(folder: &Path) -> Option<PathBuf> {
 }
 
 impl DataSet {
-    /// Adds the first `count` demonstrations of a problem, in order of their seeds, from a folder that
-    /// `sctn demos` wrote.
+    /// An empty data set that keeps at most so many MB of decoded images, besides all of them compressed.
+    pub fn new(decoded_mb: usize) -> Self {
+        Self {
+            demonstrations: Vec::new(),
+            images: ImageStore::new(decoded_mb.saturating_mul(1_000_000)),
+            scenes: BTreeMap::new(),
+        }
+    }
+
+    /// Adds the demonstrations of the first `count` scenes of a problem, in order of their seeds, from a folder that
+    /// `sctn demos` wrote: those of their own starts, or of all starts.
     pub fn load(
         &mut self,
         directory: &Path,
         problem: &str,
         count: usize,
+        all_starts: bool,
     ) -> Result<(), DataSetError> {
         let folder = directory.join(problem);
         let io = |source| DataSetError::Io {
             path: folder.clone(),
             source,
         };
-        let mut bags: Vec<(u64, PathBuf)> = Vec::new();
+        let mut scenes: BTreeMap<u64, Vec<(u64, PathBuf)>> = BTreeMap::new();
         for entry in std::fs::read_dir(&folder).map_err(io)? {
             let path = entry.map_err(io)?.path();
+            let name = path.file_name().and_then(|name| name.to_str());
             // Anything else in the folder, such as a half-written bag, has no seed for a name.
-            if let Some(seed) = path
-                .file_name()
-                .and_then(|name| name.to_str()?.parse().ok())
-            {
-                bags.push((seed, path));
+            let Some(seed) = name.and_then(demonstration_seed) else {
+                continue;
+            };
+            if seed.is_own_start() || all_starts {
+                scenes
+                    .entry(seed.scene)
+                    .or_default()
+                    .push((seed.start, path));
             }
         }
-        bags.sort();
-        if bags.len() < count {
+        if scenes.len() < count {
             return Err(DataSetError::TooFew {
                 path: folder,
-                found: bags.len(),
+                found: scenes.len(),
                 expected: count,
             });
         }
-        bags[..count]
-            .iter()
-            .try_for_each(|(_, path)| self.load_bag(path, &[problem.to_owned()]))
+        for starts in scenes.values_mut().take(count) {
+            starts.sort();
+            for (_, path) in starts {
+                self.load_bag(path, &[problem.to_owned()])?;
+            }
+        }
+        Ok(())
     }
 
     /// Adds the demonstration of one bag, also that of a recorded run, which must be of one of these problems.
@@ -158,34 +256,38 @@ impl DataSet {
 
     /// Adds a demonstration.
     pub fn push(&mut self, demonstration: Demonstration) -> Result<(), DataSetError> {
-        let mut steps = Vec::with_capacity(demonstration.steps.len());
-        let mut goals = None;
-        for (index, step) in demonstration.steps.iter().enumerate().rev() {
-            if step.delta_reward > 0.0 {
-                goals = Some((index + 1, goals.map_or(index + 1, |(next, _)| next)));
-            }
-            // Steps after the last reward lead nowhere.
-            if let Some((next_goal, goal_after)) = goals {
-                steps.push(Step {
-                    index,
-                    next_goal,
-                    goal_after,
-                });
-            }
-        }
+        let rewards = demonstration.steps.iter().enumerate();
+        let rewards = rewards.filter(|(_, step)| step.delta_reward > 0.0);
+        let goals: Vec<usize> = rewards.map(|(index, _)| index + 1).collect();
+        // Steps after the last reward lead nowhere.
+        let steps: Vec<Step> = (0..demonstration.steps.len())
+            .filter_map(|index| {
+                let goal = goals.iter().position(|goal| *goal > index)?;
+                Some(Step { index, goal })
+            })
+            .collect();
         if steps.is_empty() {
             let Demonstration { problem, seed, .. } = demonstration;
             return Err(DataSetError::NoReward { problem, seed });
         }
-        steps.reverse();
         let modules = steps
             .iter()
             .map(|step| demonstration.steps[step.index].module.clone())
             .collect();
+        let observations = (0..=demonstration.steps.len())
+            .map(|index| self.images.add(demonstration.observation(index)))
+            .collect::<Result<_, _>>()
+            .map_err(DataSetError::Image)?;
+        let scene = (demonstration.problem, demonstration.seed);
+        let number = self.demonstrations.len();
+        self.scenes.entry(scene.clone()).or_default().push(number);
         self.demonstrations.push(Indexed {
-            demonstration,
+            scene,
+            observations,
+            actions: demonstration.steps.iter().map(|step| step.action).collect(),
             steps,
             modules,
+            goals,
         });
         Ok(())
     }
@@ -208,52 +310,125 @@ impl DataSet {
             .sum()
     }
 
-    /// What a goal module compares with, of a demonstration drawn uniformly: its first image and those after its rewards.
-    pub fn draw_images<R: Rng>(&self, rng: &mut R) -> Result<Vec<&Heightmap>, DataSetError> {
-        if self.is_empty() {
-            return Err(SamplingError::Empty.into());
-        }
-        let indexed = &self.demonstrations[rng.random_range(0..self.demonstrations.len())];
-        Ok(known_images(&indexed.demonstration))
+    /// Number of scenes: demonstrations of other starts of a scene count once.
+    pub fn scene_count(&self) -> usize {
+        self.scenes.len()
     }
 
-    /// Draws a sample: a demonstration uniformly, then a step by its weights (paper, section IV-B). With
-    /// probability `goal_jitter` its goal is the one after the next.
+    /// Bytes that the compressed images take.
+    pub fn image_bytes(&self) -> usize {
+        self.images.packed_bytes()
+    }
+
+    fn image(&self, id: ImageId) -> Result<Arc<Heightmap>, DataSetError> {
+        self.images.get(id).map_err(DataSetError::Image)
+    }
+
+    fn draw_demonstration<R: Rng>(&self, rng: &mut R) -> Result<usize, DataSetError> {
+        match self.demonstrations.is_empty() {
+            true => Err(SamplingError::Empty.into()),
+            false => Ok(rng.random_range(0..self.demonstrations.len())),
+        }
+    }
+
+    /// What a goal module compares with, of a demonstration drawn uniformly: its first image and those after its rewards.
+    pub fn draw_images<R: Rng>(&self, rng: &mut R) -> Result<Vec<Arc<Heightmap>>, DataSetError> {
+        let indexed = &self.demonstrations[self.draw_demonstration(rng)?];
+        let known = std::iter::once(0).chain(indexed.goals.iter().copied());
+        known
+            .map(|index| self.image(indexed.observations[index]))
+            .collect()
+    }
+
+    /// Draws a sample: a demonstration uniformly, then a step by its weights (paper, section IV-B). With the conditioning
+    /// `sequence` it is shown a demonstration of its scene, see [`Shown`].
     pub fn draw<R: Rng>(
         &self,
-        sampling: &Sampling,
-        conditioning: GoalConditioning,
-        goal_jitter: f64,
+        rules: &DrawRules<'_>,
         rng: &mut R,
-    ) -> Result<Sample<'_>, DataSetError> {
-        if self.is_empty() {
-            return Err(SamplingError::Empty.into());
+    ) -> Result<DrawnSample, DataSetError> {
+        let number = self.draw_demonstration(rng)?;
+        let indexed = &self.demonstrations[number];
+        let step = indexed.steps[rules.sampling.draw(&indexed.modules, rng)?];
+        let image = |of: &Indexed, index: usize| self.image(of.observations[index]);
+        let action = indexed.actions[step.index];
+        if rules.conditioning == GoalConditioning::Sequence {
+            let shown = self.draw_shown(number, step.goal, rules.shown.same_start, rng);
+            let before = step.goal.checked_sub(1).map_or(0, |goal| shown.goals[goal]);
+            let done = rng.random::<f64>() < rules.shown.done;
+            let seen = match done {
+                false => step.index,
+                true => {
+                    let after = indexed.goals[step.goal];
+                    let last = indexed.observations.len() - 1;
+                    // The state right after the step as often as all later ones.
+                    match rng.random::<bool>() {
+                        true => after,
+                        false => rng.random_range(after..=last),
+                    }
+                }
+            };
+            return Ok(DrawnSample {
+                observation: image(indexed, seen)?,
+                image: image(shown, shown.goals[step.goal])?,
+                last: None,
+                previous: Some(image(shown, before)?),
+                action,
+                done,
+            });
         }
-        let indexed = &self.demonstrations[rng.random_range(0..self.demonstrations.len())];
-        let step = indexed.steps[sampling.draw(&indexed.modules, rng)?];
-        let jittered = goal_jitter > 0.0 && rng.random::<f64>() < goal_jitter;
-        let observation = |index| indexed.demonstration.observation(index);
-        let next = observation(if jittered {
-            step.goal_after
-        } else {
-            step.next_goal
-        });
-        let last = observation(indexed.demonstration.steps.len());
-        let goal = match conditioning {
-            GoalConditioning::NextStep => next.into(),
-            GoalConditioning::Final => last.into(),
-            GoalConditioning::Both => Goal {
-                image: next,
-                last: Some(last),
-            },
+        let jittered = rules.goal_jitter > 0.0 && rng.random::<f64>() < rules.goal_jitter;
+        let goal = match jittered {
+            true => (step.goal + 1).min(indexed.goals.len() - 1),
+            false => step.goal,
         };
-        let action = &indexed.demonstration.steps[step.index].action;
-        Ok(Sample {
-            observation: observation(step.index),
-            goal,
-            pick: action.pick,
-            place: action.place,
+        let next = indexed.goals[goal];
+        let last = indexed.observations.len() - 1;
+        let (shown, last) = match rules.conditioning {
+            GoalConditioning::Final => (last, None),
+            GoalConditioning::Both => (next, Some(last)),
+            GoalConditioning::NextStep | GoalConditioning::Sequence => (next, None),
+        };
+        Ok(DrawnSample {
+            observation: image(indexed, step.index)?,
+            image: image(indexed, shown)?,
+            last: last.map(|last| image(indexed, last)).transpose()?,
+            previous: None,
+            action,
+            done: false,
         })
+    }
+
+    /// The demonstration that a sample of demonstration `number` is shown for its goal `goal`.
+    fn draw_shown<R: Rng>(
+        &self,
+        number: usize,
+        goal: usize,
+        same_start: f64,
+        rng: &mut R,
+    ) -> &Indexed {
+        let own = &self.demonstrations[number];
+        let others = self.scenes[&own.scene].iter();
+        let others = others.filter(|other| **other != number);
+        let others: Vec<&Indexed> = others
+            .map(|other| &self.demonstrations[*other])
+            .filter(|other| other.goals.len() > goal)
+            .collect();
+        if others.is_empty() || rng.random::<f64>() < same_start {
+            return own;
+        }
+        others[rng.random_range(0..others.len())]
+    }
+}
+
+/// The seed of a demonstration's folder, see [`demonstration_path`].
+fn demonstration_seed(name: &str) -> Option<EpisodeSeed> {
+    match name.split_once('_') {
+        None => name.parse::<u64>().ok().map(EpisodeSeed::from),
+        Some((scene, start)) => Some(EpisodeSeed {
+            scene: scene.parse().ok()?,
+            start: start.parse().ok()?,
+        }),
     }
 }
 
@@ -302,6 +477,15 @@ mod tests {
         }
     }
 
+    fn rules(conditioning: GoalConditioning, goal_jitter: f64) -> DrawRules<'static> {
+        DrawRules {
+            sampling: &Sampling::Plain,
+            conditioning,
+            goal_jitter,
+            shown: Shown::default(),
+        }
+    }
+
     #[test]
     fn the_goal_is_the_first_observation_with_a_reward_after_the_step() {
         let mut data = DataSet::default();
@@ -310,23 +494,19 @@ mod tests {
         assert_eq!(data.step_count(), 3);
         let mut rng = ChaCha8Rng::seed_from_u64(0);
         for _ in 0..50 {
-            let sample = data
-                .draw(&Sampling::Plain, GoalConditioning::NextStep, 0.0, &mut rng)
-                .unwrap();
+            let mut draw = |conditioning| data.draw(&rules(conditioning, 0.0), &mut rng).unwrap();
+            let drawn = draw(GoalConditioning::NextStep);
+            let sample = drawn.sample();
             let expected = [2.0, 2.0, 3.0][sample.observation.height_m[0] as usize];
             assert_eq!(sample.goal.image.height_m[0], expected);
             assert_eq!(
                 sample.place.translation.x,
                 f64::from(sample.observation.height_m[0])
             );
-            let sample = data
-                .draw(&Sampling::Plain, GoalConditioning::Final, 0.0, &mut rng)
-                .unwrap();
-            assert_eq!(sample.goal.image.height_m[0], 4.0);
-            let sample = data
-                .draw(&Sampling::Plain, GoalConditioning::Both, 0.0, &mut rng)
-                .unwrap();
-            assert_eq!(sample.goal.last.unwrap().height_m[0], 4.0);
+            let drawn = draw(GoalConditioning::Final);
+            assert_eq!(drawn.sample().goal.image.height_m[0], 4.0);
+            let drawn = draw(GoalConditioning::Both);
+            assert_eq!(drawn.sample().goal.last.unwrap().height_m[0], 4.0);
         }
     }
 
@@ -337,9 +517,9 @@ mod tests {
         let mut rng = ChaCha8Rng::seed_from_u64(0);
         let mut later = 0;
         for _ in 0..2000 {
-            let sample = data
-                .draw(&Sampling::Plain, GoalConditioning::NextStep, 0.25, &mut rng)
-                .unwrap();
+            let rules = rules(GoalConditioning::NextStep, 0.25);
+            let drawn = data.draw(&rules, &mut rng).unwrap();
+            let sample = drawn.sample();
             let goal = sample.goal.image.height_m[0];
             let next = [2.0, 2.0, 3.0][sample.observation.height_m[0] as usize];
             assert!(goal == next || goal == 3.0);
@@ -347,6 +527,80 @@ mod tests {
         }
         // A quarter of the two steps that have a goal after the next.
         assert!((270..400).contains(&later), "{later}");
+    }
+
+    #[test]
+    fn a_sequence_is_shown_from_the_other_starts_of_the_scene() {
+        let mut data = DataSet::default();
+        // Three starts of a scene, one of another; heights tell them apart by hundreds.
+        for (seed, start_seed, first) in [(0, 0, 0.0), (0, 2, 100.0), (0, 4, 200.0), (2, 2, 300.0)]
+        {
+            let mut made = demonstration(&[0.0, 0.5, 0.5, 0.0]);
+            made.seed = seed;
+            made.start_seed = start_seed;
+            let observations = made.steps.iter_mut().map(|step| &mut step.observation);
+            for observation in observations.chain([&mut made.last]) {
+                observation
+                    .height_m
+                    .iter_mut()
+                    .for_each(|height| *height += first);
+            }
+            data.push(made).unwrap();
+        }
+        assert_eq!((data.len(), data.scene_count()), (4, 2));
+        let rules = DrawRules {
+            shown: Shown {
+                same_start: 0.25,
+                done: 0.5,
+            },
+            ..rules(GoalConditioning::Sequence, 0.0)
+        };
+        let mut rng = ChaCha8Rng::seed_from_u64(0);
+        let (mut own, mut done, mut of_three) = (0, 0, 0);
+        for _ in 0..2000 {
+            let drawn = data.draw(&rules, &mut rng).unwrap();
+            let sample = drawn.sample();
+            let of = |heightmap: &Heightmap| {
+                let height = heightmap.height_m[0];
+                ((height / 100.0) as usize, height as usize % 100)
+            };
+            let (seen, shown) = (of(sample.observation), of(sample.goal.image));
+            let previous = of(sample.goal.previous.unwrap());
+            assert_eq!(previous.0, shown.0, "both images are of one demonstration");
+            assert_eq!(seen.0 == 3, shown.0 == 3, "of the same scene");
+            assert!([(0, 2), (2, 3)].contains(&(previous.1, shown.1)));
+            if sample.done {
+                assert!(seen.1 >= shown.1);
+            } else {
+                assert!((previous.1..shown.1).contains(&seen.1));
+            }
+            done += usize::from(sample.done);
+            if seen.0 < 3 {
+                of_three += 1;
+                own += usize::from(seen.0 == shown.0);
+            }
+        }
+        assert!((900..1100).contains(&done), "{done}");
+        let share = own as f64 / of_three as f64;
+        assert!((0.2..0.3).contains(&share), "{share}");
+    }
+
+    #[test]
+    fn folders_are_named_by_scene_and_start() {
+        let folder = Path::new("demos");
+        for seed in [
+            EpisodeSeed::from(12),
+            EpisodeSeed {
+                scene: 12,
+                start: 14,
+            },
+        ] {
+            let path = demonstration_path(folder, "placing", seed);
+            let name = path.file_name().unwrap().to_str().unwrap();
+            assert_eq!(demonstration_seed(name), Some(seed));
+        }
+        assert_eq!(demonstration_seed("000012.part"), None);
+        assert_eq!(demonstration_seed("000012_x"), None);
     }
 
     #[test]

@@ -1,17 +1,53 @@
 //! Evaluation as in the paper (section VI): completion rate over held-out episodes.
 
+use crate::actor::{Act, Actor, Said};
 use crate::goal::{NextStepOracle, goal};
-use crate::interval::wilson_95;
+use crate::interval::bootstrap_95;
 use crate::rollout::{Rollout, demonstrate, roll_out};
 use bags::Demonstration;
-use gctn::{GoalConditioning, Policy};
-use multiravens::{Environment, EnvironmentError, Problem};
-use pick_place::PickPlace;
-use serde::Serialize;
+use multiravens::{Environment, EnvironmentError, EpisodeSeed, Problem};
+use nalgebra::Isometry2;
+use serde::{Deserialize, Serialize};
+use std::cell::RefCell;
 use std::sync::Mutex;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Instant;
+use step_protocol::FailedPicks;
 use ur5::WorkCell;
+
+/// Where the demonstration begins whose images are the goals of an episode.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Start {
+    /// At the very start of the episode: what is seen is what was shown, until the policy errs.
+    #[default]
+    Same,
+    /// At another start of the same scene: the same fixtures, objects and goal, the loose objects elsewhere.
+    Other,
+}
+
+impl Start {
+    /// What the demonstration for the episode of a scene's own start is made from.
+    pub fn shown(self, scene: u64) -> EpisodeSeed {
+        let start = match self {
+            Self::Same => scene,
+            Self::Other => scene + 1,
+        };
+        EpisodeSeed { scene, start }
+    }
+}
+
+/// Which episodes to evaluate on.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Episodes {
+    /// Seed of the first; the next ones are seed + 2, seed + 4, ...: a stride of two keeps training seeds even and
+    /// validation seeds odd.
+    pub first_seed: u64,
+    /// How many.
+    pub count: usize,
+    /// Where the shown demonstrations begin.
+    pub start: Start,
+}
 
 /// One test episode.
 #[derive(Clone, Debug, PartialEq, Serialize)]
@@ -26,6 +62,20 @@ pub struct EpisodeReport {
     pub steps: usize,
     /// Steps before which the goal module *image distance* would have named the same goal as the oracle.
     pub image_distance_right: usize,
+    /// What a network said of each step, and what came of it; none of the baseline.
+    pub said: Vec<SaidStep>,
+}
+
+/// What a network said of one of its steps, and what came of it.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct SaidStep {
+    /// What it said.
+    pub said: Said,
+    /// Whether the step earned a reward.
+    pub earned: bool,
+    /// What it said afterwards, shown the same step once more, of an earned step that another one followed: the probability
+    /// that this step is done.
+    pub done_after: Option<f64>,
 }
 
 /// An evaluation of one policy on one problem.
@@ -33,8 +83,12 @@ pub struct EpisodeReport {
 pub struct Evaluation {
     /// Name of the problem.
     pub problem: String,
-    /// `sctn` with next-step goals, `gctn` with the final goal.
+    /// `sctn` with next-step goals or a sequence, `gctn` with the final goal, `difference` for the baseline.
     pub agent: &'static str,
+    /// Where the shown demonstrations begin.
+    pub start: Start,
+    /// Name of the perturbation of what the cameras see; null without one.
+    pub perturb: Option<String>,
     /// Number of episodes.
     pub episodes: usize,
     /// Share of episodes in which every module was completed.
@@ -44,7 +98,7 @@ pub struct Evaluation {
     /// Share of all steps before which the goal module *image distance* would have named the same goal as
     /// the oracle.
     pub image_distance: f64,
-    /// 95 % interval of the completion rate (Wilson).
+    /// 95 % interval of the completion rate, by bootstrap over episodes.
     pub interval_95: [f64; 2],
     /// Seeds passed over because the demonstrator failed on them: there was no demonstration sequence.
     pub skipped_seeds: Vec<u64>,
@@ -106,53 +160,82 @@ impl From<gctn::Error> for StepError {
 /// What a policy did in one episode.
 #[derive(Clone, Debug)]
 pub struct Attempt {
-    /// The demonstration of the same start, whose images were the goals.
+    /// The demonstration whose images were the goals.
     pub shown: Demonstration,
     /// What was seen and done.
     pub rollout: Rollout,
     /// Steps before which the goal module *image distance* would have named the same goal as the oracle.
     pub image_distance_right: usize,
+    /// What a network said of each step, and what came of it; none of the baseline.
+    pub said: Vec<SaidStep>,
 }
 
-/// Lets the policy act on one episode, with the demonstration sequence of the same start. `None`: the
-/// demonstrator failed on this seed.
+/// Lets an actor act on the episode of a scene's own start, shown a demonstration. A pick that has just failed is left
+/// out, see [`FailedPicks`]. `None`: the demonstrator failed on this seed.
 pub fn attempt(
     environment: &mut Environment,
-    policy: &Policy,
+    actor: &Actor,
     seed: u64,
+    start: Start,
 ) -> Result<Option<Attempt>, EvaluationError> {
     let failed = |error| EvaluationError::Environment {
         seed,
         source: Box::new(error),
     };
-    let shown = demonstrate(environment, seed).map_err(failed)?;
+    let shown = demonstrate(environment, start.shown(seed)).map_err(failed)?;
     if !shown.complete {
         return Ok(None);
     }
     let goals = shown.demonstration.goals();
-    let conditioning = policy.config().conditioning;
-    let oracle = std::cell::Cell::new(NextStepOracle::new(goals.len()));
+    let conditioning = actor.conditioning();
+    let oracle = RefCell::new(NextStepOracle::new(goals.len()));
+    let failed_picks: RefCell<FailedPicks> = RefCell::default();
+    let said: RefCell<Option<Act>> = RefCell::default();
     let first = shown.demonstration.observation(0);
     let mut image_distance_right = 0;
+    let said_steps: RefCell<Vec<SaidStep>> = RefCell::default();
     let rollout = roll_out(
         environment,
         seed,
         |_, observation| {
             let nearest = observation.nearest(std::iter::once(first).chain(goals.iter().copied()));
-            image_distance_right += usize::from(nearest == Some(oracle.get().reached()));
-            let Some(goal) = goal(&goals, oracle.get().index(), conditioning) else {
+            let (reached, next) = (oracle.borrow().reached(), oracle.borrow().index());
+            image_distance_right += usize::from(nearest == Some(reached));
+            let Some(wanted) = goal(first, &goals, next, conditioning) else {
                 return Ok(None);
             };
-            let decision = policy.decide(observation, goal, &[])?;
-            Ok(Some(PickPlace {
-                pick: decision.pick,
-                place: decision.place,
-            }))
+            let mut said_steps = said_steps.borrow_mut();
+            if let Some(last) = said_steps.last_mut()
+                && last.earned
+                && last.said.done.is_some()
+                && let Some(index) = next.checked_sub(1)
+                && let Some(earned) = goal(first, &goals, index, conditioning)
+            {
+                last.done_after = actor.done(observation, earned)?;
+            }
+            let exclude: Vec<_> = failed_picks
+                .borrow()
+                .exclusions()
+                .map(|disk| Isometry2::new(disk.center_m.coords, 0.0))
+                .collect();
+            let act = actor.act(observation, wanted, &exclude)?;
+            *said.borrow_mut() = Some(act);
+            Ok(Some(act.action))
         },
-        |delta_reward| {
-            let mut told = oracle.get();
-            told.observe(delta_reward);
-            oracle.set(told);
+        |action, report| {
+            let before = oracle.borrow().index();
+            oracle.borrow_mut().observe(report.delta_reward);
+            let mut failed_picks = failed_picks.borrow_mut();
+            failed_picks.record(&action.pick, report.outcome.into());
+            if oracle.borrow().index() != before {
+                failed_picks.forget();
+            }
+            let said = said.borrow_mut().take().and_then(|act| act.said);
+            said_steps.borrow_mut().extend(said.map(|said| SaidStep {
+                said,
+                earned: report.delta_reward > 0.0,
+                done_after: None,
+            }));
         },
     );
     match rollout {
@@ -160,29 +243,33 @@ pub fn attempt(
             shown: shown.demonstration,
             rollout,
             image_distance_right,
+            said: said_steps.into_inner(),
         })),
         Err(StepError::Environment(source)) => Err(failed(source)),
         Err(StepError::Policy(source)) => Err(EvaluationError::Policy { seed, source }),
     }
 }
 
-/// Evaluates on `episodes` episodes, of the seeds `first_seed`, `first_seed + 2`, ...: a stride of two
-/// keeps training seeds even and validation seeds odd. One thread for each policy given; the result
-/// does not depend on how many. `progress` is told of each episode as it comes.
+/// Evaluates on episodes. One thread for each actor given, which must all be alike; the result does not depend on how
+/// many. `progress` is told of each episode as it comes.
 pub fn evaluate(
     problem: &Problem,
     work_cell: &WorkCell,
-    policies: &mut [Policy],
-    first_seed: u64,
-    episodes: usize,
+    actors: &mut [Actor],
+    plan: &Episodes,
     progress: impl Fn(&EpisodeReport, &Attempt) + Sync,
 ) -> Result<Evaluation, EvaluationError> {
+    let Episodes {
+        first_seed,
+        count: episodes,
+        start,
+    } = *plan;
     let started = Instant::now();
     let next = AtomicU64::new(0);
     let outcomes = Mutex::new(Vec::new());
     // Seeds are handed out in order, and more of them while some are passed over; what comes after the
     // last needed episode is cut off below, so that the number of threads does not matter.
-    let work = |policy: &mut Policy| -> Result<(), EvaluationError> {
+    let work = |actor: &mut Actor| -> Result<(), EvaluationError> {
         let mut environment = Environment::new(problem, work_cell);
         loop {
             let done = outcomes
@@ -203,13 +290,14 @@ pub fn evaluate(
                 });
             }
             let seed = first_seed + 2 * index;
-            let report = attempt(&mut environment, policy, seed)?.map(|attempt| {
+            let report = attempt(&mut environment, actor, seed, start)?.map(|attempt| {
                 let report = EpisodeReport {
                     seed,
                     completed: attempt.rollout.complete,
                     reward: attempt.rollout.total_reward,
                     steps: attempt.rollout.demonstration.steps.len(),
                     image_distance_right: attempt.image_distance_right,
+                    said: attempt.said.clone(),
                 };
                 progress(&report, &attempt);
                 report
@@ -221,9 +309,9 @@ pub fn evaluate(
         }
     };
     std::thread::scope(|scope| {
-        let threads: Vec<_> = policies
+        let threads: Vec<_> = actors
             .iter_mut()
-            .map(|policy| scope.spawn(|| work(policy)))
+            .map(|actor| scope.spawn(|| work(actor)))
             .collect();
         threads
             .into_iter()
@@ -252,19 +340,17 @@ pub fn evaluate(
         .iter()
         .map(|report| report.image_distance_right)
         .sum();
-    let conditioning = policies.first().map(|policy| policy.config().conditioning);
+    let outcomes = reports.iter().map(|report| report.completed).collect();
     Ok(Evaluation {
         problem: problem.name().to_owned(),
-        agent: if conditioning == Some(GoalConditioning::Final) {
-            "gctn"
-        } else {
-            "sctn"
-        },
+        agent: actors.first().map_or("sctn", Actor::name),
+        start,
+        perturb: None,
         episodes: reports.len(),
         completion: completed as f64 / count,
         reward: reports.iter().map(|report| report.reward).sum::<f64>() / count,
         image_distance: named as f64 / steps.max(1) as f64,
-        interval_95: wilson_95(completed, reports.len()),
+        interval_95: bootstrap_95(&[outcomes]),
         skipped_seeds,
         seconds: started.elapsed().as_secs_f64(),
         reports,

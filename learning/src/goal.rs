@@ -40,21 +40,28 @@ impl NextStepOracle {
     }
 }
 
-/// What a policy is shown of the demonstration sequence `images` when `next` is the index of its next-step
-/// goal. None of an empty sequence.
+/// What a policy is shown of a demonstration that begins with the image `first` and has the sequence `images`, when `next` is
+/// the index of its next-step goal. None of an empty sequence.
 pub fn goal<'a>(
+    first: &'a Heightmap,
     images: &[&'a Heightmap],
     next: usize,
     conditioning: GoalConditioning,
 ) -> Option<Goal<'a>> {
     let last = *images.last()?;
-    let next = images.get(next).copied().unwrap_or(last);
+    let index = next.min(images.len() - 1);
+    let next = images[index];
     Some(match conditioning {
+        GoalConditioning::Sequence => {
+            let before = index.checked_sub(1).map_or(first, |before| images[before]);
+            Goal::step(before, next)
+        }
         GoalConditioning::NextStep => next.into(),
         GoalConditioning::Final => last.into(),
         GoalConditioning::Both => Goal {
             image: next,
             last: Some(last),
+            previous: None,
         },
     })
 }
@@ -93,21 +100,25 @@ mod tests {
 
     #[test]
     fn each_conditioning_is_shown_its_images() {
-        let images = [1, 2, 3].map(|mark| {
+        let images = [0, 1, 2, 3].map(|mark| {
             let mut heightmap = Heightmap::new(heightmap::Workspace::RAVENS);
             heightmap.rgb[0] = mark;
             heightmap
         });
         let images: Vec<_> = images.iter().collect();
         let shown = |next, conditioning| {
-            let goal = goal(&images, next, conditioning).unwrap();
-            (goal.image.rgb[0], goal.last.map(|last| last.rgb[0]))
+            let goal = goal(images[0], &images[1..], next, conditioning).unwrap();
+            let beside = goal.last.or(goal.previous);
+            (goal.image.rgb[0], beside.map(|beside| beside.rgb[0]))
         };
         assert_eq!(shown(1, GoalConditioning::NextStep), (2, None));
         assert_eq!(shown(1, GoalConditioning::Final), (3, None));
         assert_eq!(shown(1, GoalConditioning::Both), (2, Some(3)));
         assert_eq!(shown(7, GoalConditioning::Both), (3, Some(3)));
-        assert!(goal(&[], 0, GoalConditioning::Both).is_none());
+        assert_eq!(shown(0, GoalConditioning::Sequence), (1, Some(0)));
+        assert_eq!(shown(2, GoalConditioning::Sequence), (3, Some(2)));
+        assert_eq!(shown(7, GoalConditioning::Sequence), (3, Some(2)));
+        assert!(goal(images[0], &[], 0, GoalConditioning::Both).is_none());
     }
 
     #[test]

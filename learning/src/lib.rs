@@ -1,12 +1,15 @@
 //! Sequence-conditioned learning: data set, weighted sampling, training, evaluation.
 
+mod actor;
 mod agent;
 mod data_set;
 mod embedding;
 mod evaluation;
 mod goal;
+mod images;
 mod interval;
 mod recipe;
+mod reliability;
 mod rollout;
 mod sampling;
 mod search;
@@ -15,13 +18,20 @@ mod table;
 mod tensorboard;
 mod training;
 
+pub use actor::{Act, Actor, Said, difference};
 pub use agent::Agent;
-pub use data_set::{DataSet, DataSetError, demonstration_path, recorded_run};
+pub use data_set::{
+    DataSet, DataSetError, DrawRules, DrawnSample, Shown, demonstration_path, recorded_run,
+};
 pub use embedding::EmbeddingRecipe;
-pub use evaluation::{Attempt, EpisodeReport, Evaluation, EvaluationError, attempt, evaluate};
+pub use evaluation::{
+    Attempt, EpisodeReport, Episodes, Evaluation, EvaluationError, SaidStep, Start, attempt,
+    evaluate,
+};
 pub use goal::{NextStepOracle, goal, known_images, reached};
-pub use interval::wilson_95;
+pub use interval::{bootstrap_95, wilson_95};
 pub use recipe::{Recipe, RecipeError, Validation};
+pub use reliability::{Reliability, ReliabilityBin, Unasked, reliability};
 pub use rollout::{Rollout, demonstrate, demonstrate_in_order, replay, roll_out};
 pub use sampling::{ModuleWeights, Sampling, SamplingError, StepWeights};
 pub use search::{Search, SearchError, Trial, TrialSnapshot};

@@ -1,7 +1,8 @@
 //! Training recipes: everything that makes a policy, in one YAML file.
 
+use crate::data_set::Shown;
 use crate::sampling::{Sampling, SamplingError};
-use gctn::{NetworkConfig, TrainingConfig};
+use gctn::{GoalConditioning, Network, NetworkConfig, TrainingConfig};
 use serde::{Deserialize, Serialize};
 use std::path::{Path, PathBuf};
 
@@ -27,10 +28,28 @@ pub struct Recipe {
     /// early.
     #[serde(default)]
     pub goal_jitter: f64,
+    /// What is shown to a network of the conditioning `sequence`.
+    #[serde(default, skip_serializing_if = "is_default")]
+    pub shown: Shown,
+    /// Most MB of images that are kept decoded; all of them are kept compressed. Changes no result.
+    #[serde(default = "decoded_mb", skip_serializing_if = "is_usual")]
+    pub decoded_mb: usize,
     /// Number of snapshots, evenly spread over the training.
     pub snapshots: u64,
     /// How snapshots are compared.
     pub validation: Validation,
+}
+
+fn is_default(shown: &Shown) -> bool {
+    *shown == Shown::default()
+}
+
+fn decoded_mb() -> usize {
+    512
+}
+
+fn is_usual(mb: &usize) -> bool {
+    *mb == decoded_mb()
 }
 
 /// Validation episodes, on seeds that neither training nor test uses.
@@ -153,6 +172,7 @@ impl Recipe {
             problems,
             demonstrations,
             goal_jitter,
+            shown,
             snapshots,
             validation,
             ..
@@ -168,6 +188,27 @@ impl Recipe {
             *demonstrations > 0,
             demonstrations.to_string(),
             "at least 1",
+        )?;
+        for (name, share) in [
+            ("shown.same_start", shown.same_start),
+            ("shown.done", shown.done),
+        ] {
+            let good = (0.0..=1.0).contains(&share);
+            field(name, good, share.to_string(), "0 to 1")?;
+        }
+        let sequence = recipe.network.conditioning == GoalConditioning::Sequence;
+        let says_done = matches!(recipe.network.network, Network::Matching(_));
+        field(
+            "shown.done",
+            says_done || shown.done == 0.0,
+            shown.done.to_string(),
+            "0 but for the network matching",
+        )?;
+        field(
+            "goal_jitter",
+            !sequence || *goal_jitter == 0.0,
+            goal_jitter.to_string(),
+            "0 with the conditioning sequence",
         )?;
         let good = (0.0..=1.0).contains(goal_jitter);
         field("goal_jitter", good, goal_jitter.to_string(), "0 to 1")?;

@@ -2,7 +2,7 @@
 
 use bags::{Demonstration, DemonstrationStep};
 use heightmap::Heightmap;
-use multiravens::{Environment, EnvironmentError, EpisodeSeed};
+use multiravens::{Environment, EnvironmentError, EpisodeSeed, StepReport};
 use pick_place::PickPlace;
 
 /// A rollout and how it ended.
@@ -56,7 +56,7 @@ pub fn demonstrate_in_order(
             environment.follow(order)?;
             Ok(environment.demonstrate())
         },
-        |_| (),
+        |_, _| (),
     )
 }
 
@@ -71,16 +71,16 @@ pub fn replay(
         start: demonstration.start_seed,
     };
     let mut actions = demonstration.steps.iter().map(|step| step.action);
-    roll_out(environment, seed, |_, _| Ok(actions.next()), |_| ())
+    roll_out(environment, seed, |_, _| Ok(actions.next()), |_, _| ())
 }
 
 /// Begins the episode of a seed and takes the actions of `act`, which is shown the observation, until
-/// the episode is over or it gives none. `after` is told each delta reward.
+/// the episode is over or it gives none. `after` is told each action and what it did.
 pub fn roll_out<E: From<EnvironmentError>>(
     environment: &mut Environment,
     seed: impl Into<EpisodeSeed>,
     mut act: impl FnMut(&mut Environment, &Heightmap) -> Result<Option<PickPlace>, E>,
-    mut after: impl FnMut(f64),
+    mut after: impl FnMut(&PickPlace, &StepReport),
 ) -> Result<Rollout, E> {
     let seed = seed.into();
     environment.reset(seed)?;
@@ -102,7 +102,7 @@ pub fn roll_out<E: From<EnvironmentError>>(
             outcome: report.outcome,
         });
         goals_reached.push(environment.goals_reached());
-        after(report.delta_reward);
+        after(&action, &report);
     }
     Ok(Rollout {
         demonstration: Demonstration {

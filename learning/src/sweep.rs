@@ -1,6 +1,7 @@
 //! Sweeps: the same training for many problems, agents, numbers of demonstrations and seeds (paper, section VI).
 
 use crate::agent::Agent;
+use crate::data_set::Shown;
 use crate::recipe::{Recipe, RecipeError, Validation, check_field, read_yaml};
 use gctn::{NetworkConfig, TrainingConfig};
 use serde::{Deserialize, Serialize};
@@ -222,6 +223,8 @@ impl Sweep {
             },
             sampling: run.agent.sampling(),
             goal_jitter: self.goal_jitter,
+            shown: Shown::default(),
+            decoded_mb: 512,
             snapshots: self.snapshots,
             validation: self.validation.clone(),
         }

@@ -1,6 +1,6 @@
 //! The training loop.
 
-use crate::data_set::{DataSet, DataSetError};
+use crate::data_set::{DataSet, DataSetError, DrawRules, DrawnSample};
 use crate::recipe::Recipe;
 use gctn::{Losses, ModelCard, Storage, Trainer};
 use rand::SeedableRng;
@@ -108,18 +108,21 @@ impl Training {
             network,
             sampling,
             goal_jitter,
+            shown,
             ..
         } = &self.recipe;
         let mut rng = ChaCha8Rng::seed_from_u64(training.seed);
         rng.set_stream(SAMPLING_STREAM + self.trainer.step());
-        let samples: Result<Vec<_>, _> = (0..training.batch)
-            .map(|_| {
-                let conditioning = network.conditioning;
-                self.data
-                    .draw(sampling, conditioning, *goal_jitter, &mut rng)
-            })
-            .collect();
-        Ok(self.trainer.train_step(&samples?)?)
+        let rules = DrawRules {
+            sampling,
+            conditioning: network.conditioning,
+            goal_jitter: *goal_jitter,
+            shown: *shown,
+        };
+        let drawn = (0..training.batch).map(|_| self.data.draw(&rules, &mut rng));
+        let drawn = drawn.collect::<Result<Vec<_>, _>>()?;
+        let samples: Vec<_> = drawn.iter().map(DrawnSample::sample).collect();
+        Ok(self.trainer.train_step(&samples)?)
     }
 
     /// Whether the present step is one after which a snapshot is taken.
@@ -143,6 +146,7 @@ impl Training {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::data_set::Shown;
     use crate::recipe::Validation;
     use crate::sampling::Sampling;
     use bags::{Demonstration, DemonstrationStep};
@@ -168,12 +172,13 @@ mod tests {
             start_from: None,
             training: TrainingConfig {
                 seed,
-                start_seed: seed,
                 steps: 6,
                 ..TrainingConfig::compact()
             },
             sampling: Sampling::CompStep,
             goal_jitter: 0.3,
+            shown: Shown::default(),
+            decoded_mb: 1,
             snapshots: 3,
             validation: Validation {
                 episodes: 0,

@@ -1,7 +1,7 @@
 //! Decisions and training samples: `cargo bench -p gctn --bench network`.
 
 use criterion::{Criterion, criterion_group, criterion_main};
-use gctn::{NetworkConfig, Sample, Trainer, TrainingConfig};
+use gctn::{Goal, NetworkConfig, Sample, Trainer, TrainingConfig};
 use heightmap::{Heightmap, Workspace};
 use nalgebra::{Isometry2, Vector2};
 
@@ -14,23 +14,33 @@ fn heightmap(seed: usize) -> Heightmap {
 }
 
 fn networks(criterion: &mut Criterion) {
-    let (observation, goal) = (heightmap(1), heightmap(2));
+    let [observation, previous, goal] = [1, 3, 2].map(heightmap);
     let sample = Sample {
         observation: &observation,
-        goal: (&goal).into(),
+        goal: Goal::step(&previous, &goal),
         pick: Isometry2::new(Vector2::new(0.5, 0.1), 0.0),
         place: Isometry2::new(Vector2::new(0.4, -0.2), 1.0),
+        done: false,
     };
     let compact = (NetworkConfig::compact(), TrainingConfig::compact());
     let published = (NetworkConfig::resnet43(), TrainingConfig::published());
-    for (name, (network, training)) in [("compact", compact), ("resnet43", published)] {
+    let matching = (NetworkConfig::matching(), TrainingConfig::compact());
+    let networks = [
+        ("compact", compact),
+        ("matching", matching),
+        ("resnet43", published),
+    ];
+    for (name, (network, training)) in networks {
         let mut group = criterion.benchmark_group(name);
         group.sample_size(10);
         let mut trainer = Trainer::new(&network, &training).expect("the configuration is good");
         let policy = trainer.policy().expect("a copy of the weights");
         let threads = training.threads;
         group.bench_function(format!("decide, {threads} threads"), |bencher| {
-            bencher.iter(|| policy.decide(&observation, &goal, &[]).expect("a decision"));
+            bencher.iter(|| {
+                let decision = policy.decide(&observation, sample.goal, &[]);
+                decision.expect("a decision")
+            });
         });
         let batch = vec![sample; training.batch];
         group.bench_function(

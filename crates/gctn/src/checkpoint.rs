@@ -9,7 +9,7 @@ use std::path::{Path, PathBuf};
 use tch::{Kind, Tensor};
 
 use crate::network::Parameters;
-use crate::{Error, NetworkConfig};
+use crate::{Calibration, Error, NetworkConfig};
 
 /// What the maker of a checkpoint says about it: title to text.
 pub type ModelCard = BTreeMap<String, String>;
@@ -25,6 +25,8 @@ pub enum Storage {
 
 const FORMAT: &str = "gctn-checkpoint";
 const VERSION: &str = "1";
+
+const CALIBRATION: &str = "calibration";
 
 /// A file of this crate, read into memory.
 pub(crate) struct File {
@@ -92,6 +94,14 @@ impl File {
     pub fn text(&self, key: &str) -> Result<&str, Error> {
         let text = self.head.get(key).map(String::as_str);
         text.ok_or_else(|| self.error(format!("no {key:?} in its head")))
+    }
+
+    /// The calibration of a network's file, if it has one.
+    pub fn calibration(&self) -> Result<Option<Calibration>, Error> {
+        match self.head.contains_key(CALIBRATION) {
+            true => self.json(CALIBRATION).map(Some),
+            false => Ok(None),
+        }
     }
 
     /// A value of the head that is JSON.
@@ -220,6 +230,22 @@ pub(crate) fn save(
         [("network", json(config)), ("card", json(card))],
     );
     write(path, storage, &parameters.entries, &head)
+}
+
+/// Writes a copy of a checkpoint that says how likely its decisions are to earn their steps. The weights stay as they are.
+pub fn calibrate(from: &Path, to: &Path, calibration: &Calibration) -> Result<(), Error> {
+    let file = File::read(from, FORMAT, VERSION)?;
+    let tensors =
+        SafeTensors::deserialize(&file.bytes).map_err(|error| file.error(error.to_string()))?;
+    let mut head = file.head.clone();
+    head.insert(CALIBRATION.into(), json(calibration));
+    let metadata = HashMap::from([(HEAD.to_owned(), json(&head))]);
+    let bytes = safetensors::serialize(tensors.tensors(), Some(metadata))
+        .map_err(|error| file.error(error.to_string()))?;
+    write_whole(to, &bytes).map_err(|source| Error::Io {
+        path: to.into(),
+        source,
+    })
 }
 
 /// Reads the head of a network's file: its configuration and its card.

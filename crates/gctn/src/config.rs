@@ -55,6 +55,9 @@ pub enum GoalConditioning {
     Final,
     /// Both, in this order.
     Both,
+    /// The observations before and after the next step of a demonstration, v_{k-1} and v_k, which may begin from
+    /// another start than the present episode: what it changed, not what the table looks like.
+    Sequence,
 }
 
 impl GoalConditioning {
@@ -62,8 +65,20 @@ impl GoalConditioning {
     pub(crate) const fn images(self) -> usize {
         match self {
             Self::NextStep | Self::Final => 1,
-            Self::Both => 2,
+            Self::Both | Self::Sequence => 2,
         }
+    }
+}
+
+/// As in configuration files.
+impl std::fmt::Display for GoalConditioning {
+    fn fmt(&self, formatter: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+        formatter.write_str(match self {
+            Self::NextStep => "next_step",
+            Self::Final => "final",
+            Self::Both => "both",
+            Self::Sequence => "sequence",
+        })
     }
 }
 
@@ -77,6 +92,9 @@ pub enum Network {
     Compact(Compact),
     /// One shared GR-ConvNet with the same three heads.
     GrConvnet(GrConvnet),
+    /// A U-Net that says where something appeared in the demonstration, and an embedding by which the observation is
+    /// searched for it.
+    Matching(Matching),
 }
 
 /// The published Goal-Conditioned Transporter Network (Seita et al., ICRA 2021; paper, section III-B).
@@ -158,6 +176,45 @@ impl Default for GrConvnet {
     }
 }
 
+/// A network for the conditioning `sequence`, place first. A U-Net over all images says where something appeared between
+/// v_{k-1} and v_k: the place. An embedding of v_k pooled there is searched for in the observation: the pick. What
+/// stands at the pick, turned, is correlated with what stands in v_k: the turn, and the place that belongs to this pick.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Matching {
+    /// Channels of the U-Net at strides 2, 4, 8 and 16.
+    pub channels: [usize; 4],
+    /// Residual blocks of the U-Net at strides 2, 4, 8 and 16.
+    pub blocks: [usize; 4],
+    /// Hidden channels of the embedding.
+    pub hidden_channels: usize,
+    /// Channels by which the observation is searched.
+    pub appearance_channels: usize,
+    /// Channels of the embedding that are correlated over turns.
+    pub feature_channels: usize,
+    /// Query and key channels of the U-Net, correlated beside them.
+    pub context_channels: usize,
+    /// Edge length of the query window round the pick, in cells of stride 2. Odd.
+    pub window_cells: usize,
+    /// How the query window is rotated.
+    pub rotation_sampling: Interpolation,
+}
+
+impl Default for Matching {
+    fn default() -> Self {
+        Self {
+            channels: [16, 32, 64, 96],
+            blocks: [1, 1, 1, 2],
+            hidden_channels: 24,
+            appearance_channels: 16,
+            feature_channels: 6,
+            context_channels: 4,
+            window_cells: 21,
+            rotation_sampling: Interpolation::Bilinear,
+        }
+    }
+}
+
 /// How an image is sampled between its cells.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
 #[serde(rename_all = "snake_case")]
@@ -201,6 +258,14 @@ impl NetworkConfig {
     /// The compact network with its default sizes.
     pub fn compact() -> Self {
         Self::new(Network::Compact(Compact::default()))
+    }
+
+    /// The matching network with its default sizes, conditioned on a sequence.
+    pub fn matching() -> Self {
+        Self {
+            conditioning: GoalConditioning::Sequence,
+            ..Self::new(Network::Matching(Matching::default()))
+        }
     }
 
     /// The published network.
@@ -257,6 +322,29 @@ impl NetworkConfig {
                 )?;
                 check("blocks", blocks <= 16, blocks, "0 to 16")?;
                 heads(gr_convnet.feature_channels, gr_convnet.window_cells)
+            }
+            Network::Matching(matching) => {
+                let good = self.conditioning == GoalConditioning::Sequence;
+                check(
+                    "conditioning",
+                    good,
+                    self.conditioning,
+                    "sequence for the network matching",
+                )?;
+                let good = matching.channels.iter().all(channels);
+                let actual = format!("{:?}", matching.channels);
+                check("channels", good, actual, "1 to 1024 each")?;
+                let good = matching.blocks.iter().all(|blocks| *blocks <= 16);
+                let actual = format!("{:?}", matching.blocks);
+                check("blocks", good, actual, "0 to 16 each")?;
+                for (what, value) in [
+                    ("hidden_channels", matching.hidden_channels),
+                    ("appearance_channels", matching.appearance_channels),
+                    ("context_channels", matching.context_channels),
+                ] {
+                    check(what, channels(&value), value, "1 to 1024")?;
+                }
+                heads(matching.feature_channels, matching.window_cells)
             }
         }
     }
@@ -389,6 +477,42 @@ pub struct Augmentation {
     pub hue_probability: f64,
     /// Standard deviation of the logarithm of a gain on each colour channel, observation and goal alike.
     pub gain_sigma: f64,
+    /// Share of samples whose colour channels change places, in all images alike.
+    pub permutation_probability: f64,
+    /// Share of samples that are mirrored, all images alike; the turn changes its sign.
+    pub mirror_probability: f64,
+    /// What is drawn for each image on its own.
+    pub sensor: SensorNoise,
+}
+
+/// What another exposure does to an image: drawn for each image of a sample on its own.
+#[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct SensorNoise {
+    /// Standard deviation of the logarithm of a gain on all colours.
+    pub gain_sigma: f64,
+    /// Standard deviation of the logarithm of a further gain on each colour channel.
+    pub tint_sigma: f64,
+    /// Largest error of a colour of a cell, of 255; uniform.
+    pub color_noise: f64,
+    /// Largest error of the height of a cell; uniform.
+    pub height_noise_m: f64,
+    /// Standard deviation of an error of all heights.
+    pub height_offset_sigma_m: f64,
+    /// Share of cells whose height is missing and reads 0.
+    pub hole_share: f64,
+}
+
+impl SensorNoise {
+    /// None at all.
+    pub const NONE: Self = Self {
+        gain_sigma: 0.0,
+        tint_sigma: 0.0,
+        color_noise: 0.0,
+        height_noise_m: 0.0,
+        height_offset_sigma_m: 0.0,
+        hole_share: 0.0,
+    };
 }
 
 impl Augmentation {
@@ -399,6 +523,9 @@ impl Augmentation {
         interpolation: Interpolation::Nearest,
         hue_probability: 0.0,
         gain_sigma: 0.0,
+        permutation_probability: 0.0,
+        mirror_probability: 0.0,
+        sensor: SensorNoise::NONE,
     };
 }
 
@@ -456,7 +583,7 @@ impl TrainingConfig {
         let not_negative = |value: f64| value.is_finite() && value >= 0.0;
         let rate = self.learning_rate;
         let augmentation = &self.augmentation;
-        let probability = augmentation.hue_probability;
+        let sensor = &augmentation.sensor;
         check("steps", self.steps > 0, self.steps, "at least 1")?;
         let good = (1..=1024).contains(&self.batch);
         check("batch", good, self.batch, "1 to 1024")?;
@@ -472,11 +599,25 @@ impl TrainingConfig {
             ("rotation_sigma_deg", augmentation.rotation_sigma_deg),
             ("translation_sigma_px", augmentation.translation_sigma_px),
             ("gain_sigma", augmentation.gain_sigma),
+            ("sensor.gain_sigma", sensor.gain_sigma),
+            ("sensor.tint_sigma", sensor.tint_sigma),
+            ("sensor.color_noise", sensor.color_noise),
+            ("sensor.height_noise_m", sensor.height_noise_m),
+            ("sensor.height_offset_sigma_m", sensor.height_offset_sigma_m),
         ] {
             check(what, not_negative(value), value, "0 or a positive number")?;
         }
-        let good = (0.0..=1.0).contains(&probability);
-        check("hue_probability", good, probability, "0 to 1")?;
+        for (what, share) in [
+            ("hue_probability", augmentation.hue_probability),
+            (
+                "permutation_probability",
+                augmentation.permutation_probability,
+            ),
+            ("mirror_probability", augmentation.mirror_probability),
+            ("sensor.hole_share", sensor.hole_share),
+        ] {
+            check(what, (0.0..=1.0).contains(&share), share, "0 to 1")?;
+        }
         let good = (1..=1024).contains(&self.threads);
         check("threads", good, self.threads, "1 to 1024")
     }

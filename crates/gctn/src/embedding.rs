@@ -247,7 +247,7 @@ impl EmbeddingTrainer {
         let config = &self.net.config;
         let (rows, cols) = (config.rows, config.cols);
         let middle = [Point2::new(cols as f64 / 2.0, rows as f64 / 2.0); 2];
-        let warp = Warp::draw(&self.training.augmentation, rows, cols, middle, rng);
+        let warp = Warp::draw(&self.training.augmentation, rows, cols, 1, middle, rng);
         let cells = ENCODING.channels() * rows * cols;
         let mut encoded = vec![0.0; images.len() * cells];
         for (image, out) in images.iter().zip(encoded.chunks_exact_mut(cells)) {

@@ -31,17 +31,25 @@ pub enum Error {
         /// What is wrong with it.
         source: heightmap::HeightmapError,
     },
-    /// Goals that are not those that the network is conditioned on.
-    #[error(
-        "{actual} goal images, but the network is conditioned on {conditioning:?}: expected {expected}"
-    )]
-    Goals {
-        /// What it is conditioned on.
+    /// A goal without an image that the network is conditioned on.
+    #[error("the network is conditioned on {conditioning}, but {what} is missing")]
+    GoalMissing {
+        /// Which image.
+        what: &'static str,
+        /// What the network is conditioned on.
         conditioning: crate::GoalConditioning,
-        /// Images given.
-        actual: usize,
-        /// Images expected.
-        expected: usize,
+    },
+    /// A goal with a final goal, though the network is not conditioned on it.
+    #[error("the network is conditioned on {conditioning}, but there is a final goal beside")]
+    GoalTooMany {
+        /// What the network is conditioned on.
+        conditioning: crate::GoalConditioning,
+    },
+    /// A sample of a step that is done, for a network that cannot say so.
+    #[error("sample {index}: the step is done already, which only the network matching learns")]
+    Done {
+        /// Index of the sample in the batch.
+        index: usize,
     },
     /// A training label off the heightmap, or not finite.
     #[error(

@@ -5,7 +5,7 @@ use nalgebra::{Isometry2, Point2, Vector3};
 use tch::Tensor;
 
 use crate::augment::Warp;
-use crate::{Error, Goal, Interpolation, NetworkConfig, Sample};
+use crate::{Error, Goal, GoalConditioning, Interpolation, NetworkConfig, Sample};
 
 /// Colour (0..255) and height (m) of a cell.
 type Cell = [f32; 4];
@@ -25,40 +25,71 @@ pub(crate) enum Reading {
     /// RGB and height, scaled. With each goal its difference from the observation, the mean absolute colour
     /// difference and the absolute height difference.
     Difference,
+    /// RGB and height, scaled, of the observation o_t, of v_{k-1} and of v_k; then v_k - v_{k-1} and v_k - o_t, and of both
+    /// the mean absolute colour difference and the absolute height difference. For exactly two goals: v_k, v_{k-1}.
+    Sequence,
+}
+
+/// Channels of [`Reading::Sequence`]: where those of an image begin, four each.
+pub(crate) mod sequence {
+    pub const OBSERVATION: i64 = 0;
+    pub const IMAGE: i64 = 8;
+    pub const CHANNELS: usize = 24;
 }
 
 impl Reading {
-    /// Channels of the observation, and of each goal.
-    const fn channels(self) -> [usize; 2] {
+    /// Channels of the observation and of so many goals.
+    const fn channels(self, goals: usize) -> usize {
         match self {
-            Self::Raw => [4, 4],
-            Self::Difference => [4, 10],
+            Self::Raw => 4 + 4 * goals,
+            Self::Difference => 4 + 10 * goals,
+            Self::Sequence => sequence::CHANNELS,
         }
     }
 
     #[inline(always)]
-    fn write(self, observation: Cell, goals: impl Iterator<Item = Cell>, out: &mut [f32]) {
+    fn write(self, observation: Cell, mut goals: impl Iterator<Item = Cell>, out: &mut [f32]) {
         // Heights of 40 mm, the edge of a block, count as much as half the range of a colour.
         let scaled = |cell: Cell| -> Cell {
             std::array::from_fn(|i| match (self, i) {
                 (Self::Raw, _) => cell[i],
-                (Self::Difference, 3) => cell[3] * (1.0 / 0.04),
-                (Self::Difference, _) => cell[i] * (1.0 / 128.0) - 1.1,
+                (_, 3) => cell[3] * (1.0 / 0.04),
+                (_, _) => cell[i] * (1.0 / 128.0) - 1.1,
             })
         };
-        let [own, each] = self.channels();
-        let (first, rest) = out.split_at_mut(own);
+        let difference = |a: Cell, b: Cell| -> Cell { std::array::from_fn(|i| a[i] - b[i]) };
+        let sizes = |difference: Cell| {
+            let colour = difference[0].abs() + difference[1].abs() + difference[2].abs();
+            [colour * (1.0 / 3.0), difference[3].abs()]
+        };
         let observation = scaled(observation);
+        let (first, rest) = out.split_at_mut(4);
         first.copy_from_slice(&observation);
-        for (goal, out) in goals.zip(rest.chunks_exact_mut(each)) {
-            let goal = scaled(goal);
-            out[..4].copy_from_slice(&goal);
-            if self == Self::Difference {
-                let difference: Cell = std::array::from_fn(|i| goal[i] - observation[i]);
-                out[4..8].copy_from_slice(&difference);
-                let colour = difference[0].abs() + difference[1].abs() + difference[2].abs();
-                out[8] = colour * (1.0 / 3.0);
-                out[9] = difference[3].abs();
+        match self {
+            Self::Raw => {
+                for (goal, out) in goals.zip(rest.chunks_exact_mut(4)) {
+                    out.copy_from_slice(&goal);
+                }
+            }
+            Self::Difference => {
+                for (goal, out) in goals.zip(rest.chunks_exact_mut(10)) {
+                    let goal = scaled(goal);
+                    let difference = difference(goal, observation);
+                    out[..4].copy_from_slice(&goal);
+                    out[4..8].copy_from_slice(&difference);
+                    out[8..].copy_from_slice(&sizes(difference));
+                }
+            }
+            Self::Sequence => {
+                let mut next = || goals.next().map(scaled).unwrap_or_default();
+                let (image, previous) = (next(), next());
+                let changes = [difference(image, previous), difference(image, observation)];
+                rest[..4].copy_from_slice(&previous);
+                rest[4..8].copy_from_slice(&image);
+                for (index, change) in changes.into_iter().enumerate() {
+                    rest[8 + 4 * index..12 + 4 * index].copy_from_slice(&change);
+                    rest[16 + 2 * index..18 + 2 * index].copy_from_slice(&sizes(change));
+                }
             }
         }
     }
@@ -67,8 +98,7 @@ impl Reading {
 impl Encoding {
     /// Number of channels.
     pub const fn channels(self) -> usize {
-        let [own, each] = self.reading.channels();
-        own + each * self.goals
+        self.reading.channels(self.goals)
     }
 }
 
@@ -137,9 +167,9 @@ pub(crate) fn encode(
     out: &mut [f32],
 ) {
     let observation = Image::new(observation);
-    match (goal.last, encoding.goals) {
-        (Some(last), 2) => {
-            let goals = [goal.image, last].map(Image::new);
+    match (goal.last.or(goal.previous), encoding.goals) {
+        (Some(second), 2) => {
+            let goals = [goal.image, second].map(Image::new);
             encode_goals(encoding, &observation, goals, warp, out);
         }
         _ => encode_goals(encoding, &observation, [Image::new(goal.image)], warp, out),
@@ -164,13 +194,15 @@ fn encode_goals<const GOALS: usize>(
     out: &mut [f32],
 ) {
     use Interpolation::{Bilinear, Nearest};
-    use Reading::{Difference, Raw};
+    use Reading::{Difference, Raw, Sequence};
     // Constants, so that the inner loop has no branches.
     match (encoding.reading, warp.interpolation) {
         (Raw, Nearest) => encode_as(Raw, Nearest, observation, goals, warp, out),
         (Raw, Bilinear) => encode_as(Raw, Bilinear, observation, goals, warp, out),
         (Difference, Nearest) => encode_as(Difference, Nearest, observation, goals, warp, out),
         (Difference, Bilinear) => encode_as(Difference, Bilinear, observation, goals, warp, out),
+        (Sequence, Nearest) => encode_as(Sequence, Nearest, observation, goals, warp, out),
+        (Sequence, Bilinear) => encode_as(Sequence, Bilinear, observation, goals, warp, out),
     }
 }
 
@@ -194,15 +226,28 @@ fn encode_as<const GOALS: usize>(
             [rgb.x, rgb.y, rgb.z, cell[3]]
         }
     };
-    let [own, each] = reading.channels();
-    let cells = out.chunks_exact_mut(own + each * GOALS);
+    let last_col = observation.cols as f32;
+    let cells = out.chunks_exact_mut(reading.channels(GOALS));
     for (index, out) in cells.enumerate() {
         let (row, col) = (index / observation.cols, index % observation.cols);
         let (x, y) = (col as f64 + 0.5, row as f64 + 0.5);
         let x_source = (cos * x - sin * y + offset.x) as f32;
         let y_source = (sin * x + cos * y + offset.y) as f32;
-        let at = |image: &Image<'_>| colour(image.sample(x_source, y_source, interpolation));
-        reading.write(at(observation), goals.iter().map(at), out);
+        let x_source = if warp.mirrored {
+            last_col - x_source
+        } else {
+            x_source
+        };
+        let at = |number: usize, image: &Image<'_>| {
+            let cell = colour(image.sample(x_source, y_source, interpolation));
+            match warp.sensors.get(number) {
+                None => cell,
+                Some(sensor) => sensor.read(index, cell),
+            }
+        };
+        let seen = at(0, observation);
+        let goals = goals.iter().enumerate();
+        reading.write(seen, goals.map(|(number, goal)| at(number + 1, goal)), out);
     }
 }
 
@@ -214,19 +259,34 @@ pub(crate) fn tensor(encoding: Encoding, [rows, cols]: [usize; 2], encoded: &[f3
         .permute([0, 3, 1, 2])
 }
 
-/// Refuses goals that are not those that the network is conditioned on.
+/// Refuses goals that are not those that the network is conditioned on. An image before the goal that it does not look at may
+/// be there.
 pub(crate) fn check_goal(config: &NetworkConfig, goal: Goal<'_>) -> Result<(), Error> {
-    let (actual, expected) = (goal.images().count(), config.conditioning.images());
-    if actual != expected {
-        let conditioning = config.conditioning;
-        return Err(Error::Goals {
-            conditioning,
-            actual,
-            expected,
-        });
+    let conditioning = config.conditioning;
+    let (last, previous) = match conditioning {
+        GoalConditioning::NextStep | GoalConditioning::Final => (false, false),
+        GoalConditioning::Both => (true, false),
+        GoalConditioning::Sequence => (false, true),
+    };
+    for (what, expected, image) in [
+        ("the final goal", last, goal.last),
+        ("the image before the goal", previous, goal.previous),
+    ] {
+        if expected && image.is_none() {
+            return Err(Error::GoalMissing { what, conditioning });
+        }
     }
-    goal.images()
-        .try_for_each(|image| check_heightmap(config, "goal", image))
+    if !last && goal.last.is_some() {
+        return Err(Error::GoalTooMany { conditioning });
+    }
+    let images = [
+        ("goal", Some(goal.image)),
+        ("final goal", goal.last),
+        ("image before the goal", goal.previous.filter(|_| previous)),
+    ];
+    images.into_iter().try_for_each(|(what, image)| {
+        image.map_or(Ok(()), |image| check_heightmap(config, what, image))
+    })
 }
 
 /// Refuses a heightmap that does not fit the network or itself.
@@ -268,10 +328,9 @@ pub(crate) fn check_cells(what: &'static str, heightmap: &Heightmap) -> Result<(
     }
 }
 
-/// Continuous image coordinates of a world position.
+/// Continuous image coordinates of a pose's position.
 pub(crate) fn to_px(workspace: &Workspace, pose: &Isometry2<f64>) -> Point2<f64> {
-    let from_corner = pose.translation.vector - workspace.origin_m.coords;
-    Point2::from(from_corner / workspace.pixel_size_m)
+    workspace.point_px(&pose.translation.vector.into())
 }
 
 /// World pose at continuous image coordinates.
@@ -280,8 +339,7 @@ pub(crate) fn to_world(
     point_px: Point2<f64>,
     yaw_rad: f64,
 ) -> Isometry2<f64> {
-    let position_m = workspace.origin_m.coords + point_px.coords * workspace.pixel_size_m;
-    Isometry2::new(position_m, yaw_rad)
+    Isometry2::new(workspace.point_m(&point_px).coords, yaw_rad)
 }
 
 /// What a sample teaches, in image coordinates.
@@ -293,6 +351,8 @@ pub(crate) struct Label {
     pub place_px: Point2<f64>,
     /// Index of the rotation nearest to the object's turn.
     pub rotation: usize,
+    /// Whether the step is done already: nothing is picked.
+    pub done: bool,
 }
 
 impl Label {
@@ -320,14 +380,21 @@ impl Label {
             pick_px: to_px(workspace, &sample.pick),
             place_px: to_px(workspace, &sample.place),
             rotation: rotation_index(turn, config.rotations),
+            done: sample.done,
         })
     }
 
-    /// The label after a warp. The object's turn stays: both poses turn alike.
-    pub fn warped(self, warp: &Warp) -> Self {
+    /// The label after a warp of images with so many columns. The object's turn stays, since both poses turn alike; mirrored, it
+    /// goes the other way.
+    pub fn warped(self, warp: &Warp, config: &NetworkConfig) -> Self {
+        let rotation = match warp.mirrored {
+            true => (config.rotations - self.rotation) % config.rotations,
+            false => self.rotation,
+        };
         Self {
-            pick_px: warp.motion_px * self.pick_px,
-            place_px: warp.motion_px * self.place_px,
+            pick_px: warp.moved(self.pick_px, config.cols),
+            place_px: warp.moved(self.place_px, config.cols),
+            rotation,
             ..self
         }
     }
@@ -367,14 +434,12 @@ mod tests {
         let encoding = Encoding { reading, goals: 2 };
         assert_eq!(encoding.channels(), 24);
         let mut out = vec![0.0; 24 * observation.workspace.len()];
-        let (image, last) = (&next, Some(&last));
-        encode(
-            encoding,
-            &observation,
-            Goal { image, last },
-            &Warp::identity(),
-            &mut out,
-        );
+        let goal = Goal {
+            image: &next,
+            last: Some(&last),
+            previous: None,
+        };
+        encode(encoding, &observation, goal, &Warp::identity(), &mut out);
         let close = |index: usize, value: f32| (out[index] - value).abs() < 1e-6;
         // Height of the observation; height, its difference and absolute difference of each goal.
         for (index, value) in [
@@ -389,6 +454,51 @@ mod tests {
             assert!(close(index, value), "channel {index} is {}", out[index]);
         }
         assert!(close(12, 2.0 / 128.0) && close(22, 5.0 / 128.0));
+    }
+
+    #[test]
+    fn a_sequence_is_read_with_what_it_changed_and_what_is_left_to_change() {
+        let [observation, previous, image] = [1.0, 3.0, 6.0].map(|height_m: f32| {
+            let mut heightmap = Heightmap::new(Workspace::RAVENS);
+            heightmap.height_m.fill(0.04 * height_m);
+            heightmap.rgb.fill(height_m as u8);
+            heightmap
+        });
+        let encoding = Encoding {
+            reading: Reading::Sequence,
+            goals: 2,
+        };
+        assert_eq!(encoding.channels(), sequence::CHANNELS);
+        let mut out = vec![0.0; encoding.channels() * observation.workspace.len()];
+        let goal = Goal::step(&previous, &image);
+        encode(encoding, &observation, goal, &Warp::identity(), &mut out);
+        // Heights: o, v_{k-1}, v_k, v_k - v_{k-1}, v_k - o, and both once more without a sign.
+        let heights = [3, 7, 11, 15, 19, 21, 23].map(|channel| out[channel].round());
+        assert_eq!(heights, [1.0, 3.0, 6.0, 3.0, 5.0, 3.0, 5.0]);
+        assert!((out[20] - 3.0 / 128.0).abs() < 1e-6 && (out[22] - 5.0 / 128.0).abs() < 1e-6);
+    }
+
+    #[test]
+    fn a_mirrored_label_lies_on_the_mirrored_object() {
+        let heightmap = numbered();
+        let warp = Warp {
+            mirrored: true,
+            motion_px: Isometry2::translation(3.0, 5.0),
+            ..Warp::identity()
+        };
+        let label = Label {
+            pick_px: Point2::new(20.5, 30.5),
+            place_px: Point2::new(80.0, 160.0),
+            rotation: 3,
+            done: false,
+        };
+        let warped = label.warped(&warp, &NetworkConfig::compact());
+        assert_eq!(warped.rotation, 33);
+        let (row, col) = (warped.pick_px.y as usize, warped.pick_px.x as usize);
+        assert_eq!(
+            heights(&warp)[row * 160 + col],
+            heightmap.height_m[30 * 160 + 20]
+        );
     }
 
     fn numbered() -> Heightmap {
@@ -504,6 +614,7 @@ mod tests {
             goal: (&heightmap).into(),
             pick: Isometry2::new(Vector2::new(0.5, 0.0), 0.0),
             place: Isometry2::new(Vector2::new(0.5, f64::NAN), 0.0),
+            done: false,
         };
         let error = Label::of(&NetworkConfig::compact(), 3, &sample).unwrap_err();
         assert!(

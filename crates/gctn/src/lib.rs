@@ -4,6 +4,7 @@
 //! become, into a pick and a place pose in SE(2); a [`Trainer`] makes one from demonstrated steps.
 
 mod augment;
+mod calibration;
 mod checkpoint;
 mod config;
 mod correlation;
@@ -18,11 +19,12 @@ mod policy;
 mod sample;
 mod trainer;
 
-pub use checkpoint::{ModelCard, Storage};
+pub use calibration::{Calibration, Evidence, Verdict};
+pub use checkpoint::{ModelCard, Storage, calibrate};
 pub use config::{
     Augmentation, Compact, Device, EmbeddingConfig, EmbeddingTraining, GoalConditioning, GrConvnet,
-    Interpolation, Network, NetworkConfig, PlaceLoss, Precision, Resnet43, Schedule,
-    TrainingConfig,
+    Interpolation, Matching, Network, NetworkConfig, PlaceLoss, Precision, Resnet43, Schedule,
+    SensorNoise, TrainingConfig,
 };
 pub use embedding::{Embedded, Embedding, EmbeddingLoss, EmbeddingTrainer};
 pub use error::Error;

@@ -6,7 +6,7 @@ use tch::{Kind, Tensor};
 
 use crate::correlation::{correlate, rotated_windows};
 use crate::input::Label;
-use crate::network::{Features, Grid};
+use crate::network::{Features, FirstPlace, Grid};
 use crate::{Interpolation, PlaceLoss};
 
 /// Continuous index on the grid of a point of the image.
@@ -90,7 +90,42 @@ pub(crate) fn place_logits(
     rotations: usize,
 ) -> Tensor {
     let windows = query_windows(grid, features, picks_px, turns, rotations);
-    correlate(&features.key, &windows, grid) * &features.scale
+    correlated(grid, features, &windows)
+}
+
+/// What windows say of each place, and what was said of it before the pick.
+fn correlated(grid: &Grid, features: &Features, windows: &Tensor) -> Tensor {
+    let logits = correlate(&features.key, windows, grid) * &features.scale;
+    match &features.first {
+        Some(first) => logits + first.place.unsqueeze(1),
+        None => logits,
+    }
+}
+
+/// Mean loss of the place that is said before the pick is known: cross entropy. Samples whose step is done count too.
+pub(crate) fn first_place_loss(
+    grid: &Grid,
+    sigma_cells: f64,
+    first: &FirstPlace,
+    labels: &[Label],
+) -> Tensor {
+    let points: Vec<_> = labels.iter().map(|label| label.place_px).collect();
+    let target = targets(grid, sigma_cells, &points, &first.place);
+    cross_entropy(&first.place, &first.place, &target)
+}
+
+/// Mean loss of whether the step is done: binary cross entropy.
+pub(crate) fn done_loss(first: &FirstPlace, labels: &[Label]) -> Tensor {
+    let done: Vec<_> = labels
+        .iter()
+        .map(|label| f64::from(u8::from(label.done)))
+        .collect();
+    let done = Tensor::from_slice(&done)
+        .to_kind(first.done.kind())
+        .to_device(first.done.device());
+    first
+        .done
+        .binary_cross_entropy_with_logits::<Tensor>(&done, None, None, tch::Reduction::Mean)
 }
 
 pub(crate) fn query_windows(
@@ -152,7 +187,7 @@ pub(crate) fn place_loss(
             let turn_loss =
                 dots.cross_entropy_loss(&right, None::<&Tensor>, tch::Reduction::Mean, -100, 0.0);
             if rotations == 1 {
-                let logits = correlate(key, &windows, grid) * &features.scale;
+                let logits = correlated(grid, features, &windows);
                 return turn_loss + cross_entropy(&logits, &logits.squeeze_dim(1), &target);
             }
             let chosen: Vec<i64> = labels
@@ -167,7 +202,7 @@ pub(crate) fn place_loss(
             let chosen = chosen
                 .view([-1, 2, 1, 1, 1])
                 .expand([size[0], 2, size[2], size[3], size[4]], false);
-            let logits = correlate(key, &windows.gather(1, &chosen, false), grid) * &features.scale;
+            let logits = correlated(grid, features, &windows.gather(1, &chosen, false));
             turn_loss + cross_entropy(&logits, &logits.select(1, 0), &target)
         }
     }
@@ -231,6 +266,7 @@ mod tests {
             query: image(sample.observation),
             key: image(sample.goal.image).constant_pad_nd([12; 4]),
             scale: Tensor::ones([1], (Kind::Float, tch::Device::Cpu)),
+            first: None,
         }
     }
 
@@ -248,6 +284,7 @@ mod tests {
                 goal: (&goal).into(),
                 pick: Isometry2::new((first * Point2::from(held)).coords, 0.1),
                 place: Isometry2::new((then * Point2::from(held)).coords, 0.1 + turn),
+                done: false,
             };
             let label = Label::of(&NetworkConfig::compact(), 0, &sample).unwrap();
             assert_eq!(label.rotation, rotation);

@@ -8,14 +8,17 @@ use tch::{Kind, Tensor};
 use crate::augment::Warp;
 use crate::input::{check_goal, check_heightmap, encode, rotation_angle, tensor, to_px, to_world};
 use crate::losses::place_logits;
-use crate::network::{Builder, Model};
-use crate::{Device, Error, Goal, ModelCard, NetworkConfig, Precision, checkpoint};
+use crate::network::{Builder, Features, Model};
+use crate::{
+    Calibration, Device, Error, Evidence, Goal, ModelCard, NetworkConfig, Precision, checkpoint,
+};
 
 /// A trained network that decides.
 #[derive(Debug)]
 pub struct Policy {
     model: Model,
     card: ModelCard,
+    calibration: Option<Calibration>,
     device: tch::Device,
     exclusion_radius_m: f64,
 }
@@ -42,6 +45,12 @@ pub struct Decision {
     pub pick_score: f64,
     /// Probability of the placed cell and rotation.
     pub place_score: f64,
+    /// Probability that the step is done already, of a network that says so.
+    pub done: Option<f64>,
+    /// What the network says of this decision in numbers that can be weighed.
+    pub evidence: Evidence,
+    /// Probability that the step earns its reward, of a checkpoint with a calibration.
+    pub success: Option<f64>,
     /// Probabilities of pick cells; excluded ones have 0.
     pub pick_map: ScoreMap,
     /// Probabilities of place cells at the rotation decided on. They sum to less than 1: the rest is with
@@ -63,13 +72,22 @@ impl Policy {
         let (file, config, card) = checkpoint::open(path)?;
         let model = Model::new(&config, Builder::empty(device), precision);
         file.fill(&model.parameters.entries)?;
-        Ok(Self::new(model, card, device))
+        Ok(Self {
+            calibration: file.calibration()?,
+            ..Self::new(model, card, device)
+        })
+    }
+
+    /// How likely its decisions are to earn their steps, where the checkpoint says so.
+    pub fn calibration(&self) -> Option<&Calibration> {
+        self.calibration.as_ref()
     }
 
     pub(crate) fn new(model: Model, card: ModelCard, device: tch::Device) -> Self {
         Self {
             model,
             card,
+            calibration: None,
             device,
             exclusion_radius_m: 0.02,
         }
@@ -94,28 +112,18 @@ impl Policy {
     }
 
     /// Decides where to pick and where to place, given what is seen and what it should become (the goals that
-    /// the network is [conditioned](crate::GoalConditioning) on). Cells near an excluded pick (world) are left out. The same input and number of threads give the same bits.
+    /// the network is [conditioned](crate::GoalConditioning) on: for `sequence` [`Goal::step`]). Cells near an excluded pick (world) are left out. The same input and number of threads give the same bits.
     pub fn decide<'a>(
         &self,
         observation: &Heightmap,
         goal: impl Into<Goal<'a>>,
         exclude: &[Isometry2<f64>],
     ) -> Result<Decision, Error> {
-        crate::apply_threads();
         let config = &self.model.config;
-        let goal = goal.into();
-        check_heightmap(config, "observation", observation)?;
-        check_goal(config, goal)?;
         let workspace = &observation.workspace;
         let exclude_px: Vec<_> = exclude.iter().map(|pick| to_px(workspace, pick)).collect();
         tch::no_grad(|| {
-            let encoding = self.model.encoding();
-            let mut encoded = vec![0.0; encoding.channels() * workspace.len()];
-            encode(encoding, observation, goal, &Warp::identity(), &mut encoded);
-            let input =
-                tensor(encoding, [config.rows, config.cols], &encoded).to_device(self.device);
-            let features = self.model.forward(&input);
-
+            let features = self.features(observation, goal.into())?;
             let (pick_px, pick_score, pick_map) = self.pick(&features.pick, &exclude_px)?;
             let turns = [(0..config.rotations).collect()];
             let grid = &self.model.grid;
@@ -127,7 +135,19 @@ impl Policy {
             if yaw_rad > std::f64::consts::PI {
                 yaw_rad -= std::f64::consts::TAU;
             }
+            let done = done(&features)?;
+            let stride = self.model.grid.stride;
+            let evidence = Evidence::new(
+                (&pick_map, [pick_px.x, pick_px.y]),
+                (&place_map, [place_px.x, place_px.y]),
+                stride,
+                done,
+            );
+            let calibration = self.calibration.as_ref();
             Ok(Decision {
+                done,
+                evidence,
+                success: calibration.map(|calibration| calibration.probability(&evidence)),
                 pick: to_world(workspace, pick_px, 0.0),
                 place: to_world(workspace, place_px, yaw_rad),
                 pick_score,
@@ -136,6 +156,29 @@ impl Policy {
                 place_map,
             })
         })
+    }
+
+    /// Probability that a step is done already: that the observation shows what the goal shows, also from another start. `None`
+    /// of a network that does not say so.
+    pub fn done<'a>(
+        &self,
+        observation: &Heightmap,
+        goal: impl Into<Goal<'a>>,
+    ) -> Result<Option<f64>, Error> {
+        tch::no_grad(|| done(&self.features(observation, goal.into())?))
+    }
+
+    /// What the network says, after its inputs are checked.
+    fn features(&self, observation: &Heightmap, goal: Goal<'_>) -> Result<Features, Error> {
+        crate::apply_threads();
+        let config = &self.model.config;
+        check_heightmap(config, "observation", observation)?;
+        check_goal(config, goal)?;
+        let encoding = self.model.encoding();
+        let mut encoded = vec![0.0; encoding.channels() * observation.workspace.len()];
+        encode(encoding, observation, goal, &Warp::identity(), &mut encoded);
+        let input = tensor(encoding, [config.rows, config.cols], &encoded);
+        Ok(self.model.forward(&input.to_device(self.device)))
     }
 
     fn map(&self, scores: Vec<f32>) -> ScoreMap {
@@ -215,6 +258,12 @@ impl Policy {
         let scores = map.iter().map(|logit| score(*logit) as f32).collect();
         Ok((place_px, rotation, score(logits[best]), self.map(scores)))
     }
+}
+
+fn done(features: &Features) -> Result<Option<f64>, Error> {
+    let first = features.first.as_ref();
+    let done = first.map(|first| values(&first.done.sigmoid(), "whether the step is done"));
+    Ok(done.transpose()?.map(|done| f64::from(done[0])))
 }
 
 /// The numbers of a tensor, all finite.

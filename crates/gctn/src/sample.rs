@@ -1,5 +1,6 @@
 //! Training samples.
 
+use crate::GoalConditioning;
 use heightmap::Heightmap;
 use nalgebra::Isometry2;
 
@@ -10,18 +11,41 @@ pub struct Goal<'a> {
     pub image: &'a Heightmap,
     /// The final goal, for networks conditioned on both.
     pub last: Option<&'a Heightmap>,
+    /// The image of the demonstration before the next-step goal, for networks conditioned on a sequence; others
+    /// do not look at it.
+    pub previous: Option<&'a Heightmap>,
 }
 
 impl<'a> From<&'a Heightmap> for Goal<'a> {
     fn from(image: &'a Heightmap) -> Self {
-        Self { image, last: None }
+        Self {
+            image,
+            last: None,
+            previous: None,
+        }
     }
 }
 
 impl<'a> Goal<'a> {
-    /// The images there are.
-    pub(crate) fn images(self) -> impl Iterator<Item = &'a Heightmap> {
-        std::iter::once(self.image).chain(self.last)
+    /// The next step of a demonstration: its images before and after, v_{k-1} and v_k.
+    pub fn step(previous: &'a Heightmap, image: &'a Heightmap) -> Self {
+        Self {
+            image,
+            last: None,
+            previous: Some(previous),
+        }
+    }
+
+    /// The same goal as a network of this conditioning takes it: without an image before the goal that it does not
+    /// look at.
+    pub fn for_conditioning(self, conditioning: GoalConditioning) -> Self {
+        match conditioning {
+            GoalConditioning::Sequence => self,
+            GoalConditioning::NextStep | GoalConditioning::Final | GoalConditioning::Both => Self {
+                previous: None,
+                ..self
+            },
+        }
     }
 }
 
@@ -36,4 +60,7 @@ pub struct Sample<'a> {
     pub pick: Isometry2<f64>,
     /// Where it placed, in the world. The object was turned by the yaw of place less that of pick.
     pub place: Isometry2<f64>,
+    /// Whether the goal is reached already in the observation: there is nothing to pick, and pick and place teach
+    /// nothing but, to networks that say so, that the step is done.
+    pub done: bool,
 }

@@ -7,8 +7,8 @@ use tch::Tensor;
 use crate::augment::Warp;
 use crate::checkpoint::{self, File};
 use crate::input::{Label, encode, tensor};
-use crate::losses::{pick_loss, place_loss};
-use crate::network::{Builder, Model};
+use crate::losses::{done_loss, first_place_loss, pick_loss, place_loss};
+use crate::network::{Builder, Features, Model};
 use crate::optimiser::{self, AdamW, Rate};
 use crate::{Error, ModelCard, NetworkConfig, Policy, Sample, Storage, TrainingConfig};
 
@@ -28,8 +28,10 @@ pub struct Trainer {
 pub struct Losses {
     /// Pick loss. Its floor is the entropy of the demonstrator's own choice.
     pub pick: f64,
-    /// Place loss.
+    /// Place loss; of a network that finds the place first, the loss of that included.
     pub place: f64,
+    /// Loss of whether the step is done already; 0 of a network that does not say so.
+    pub done: f64,
     /// Norm of the gradient before clipping; 0 where none was taken.
     pub gradient_norm: f64,
 }
@@ -116,8 +118,9 @@ impl Trainer {
         // A stream of its own for each step: the random state is the step's number.
         let mut rng = ChaCha8Rng::seed_from_u64(self.config.seed);
         rng.set_stream(self.step + 1);
-        let [pick, place] = self.forward(samples, &mut rng, true)?;
-        let gradients = Tensor::f_run_backward(&[&pick + &place], &self.weights, false, false)?;
+        let [pick, place, done] = self.forward(samples, &mut rng, true)?;
+        let sum = &pick + &place + &done;
+        let gradients = Tensor::f_run_backward(&[sum], &self.weights, false, false)?;
         let flat: Vec<Tensor> = gradients
             .iter()
             .map(|gradient| gradient.reshape([-1]))
@@ -126,11 +129,13 @@ impl Trainer {
         let losses = Losses {
             pick: pick.double_value(&[]),
             place: place.double_value(&[]),
+            done: done.double_value(&[]),
             gradient_norm: gradient.norm().double_value(&[]),
         };
         for (what, value) in [
             ("the pick loss", losses.pick),
             ("the place loss", losses.place),
+            ("the loss of what is done", losses.done),
             ("the gradient", losses.gradient_norm),
         ] {
             if !value.is_finite() {
@@ -159,10 +164,11 @@ impl Trainer {
             });
         }
         let mut rng = ChaCha8Rng::seed_from_u64(self.config.seed);
-        let [pick, place] = tch::no_grad(|| self.forward(samples, &mut rng, false))?;
+        let [pick, place, done] = tch::no_grad(|| self.forward(samples, &mut rng, false))?;
         Ok(Losses {
             pick: pick.double_value(&[]),
             place: place.double_value(&[]),
+            done: done.double_value(&[]),
             gradient_norm: 0.0,
         })
     }
@@ -172,7 +178,7 @@ impl Trainer {
         samples: &[Sample<'_>],
         rng: &mut ChaCha8Rng,
         augment: bool,
-    ) -> Result<[Tensor; 2], Error> {
+    ) -> Result<[Tensor; 3], Error> {
         crate::apply_threads();
         let network = &self.model.config;
         let encoding = self.model.encoding();
@@ -182,12 +188,16 @@ impl Trainer {
         let images = encoded.chunks_exact_mut(encoding.channels() * cells);
         for ((index, sample), image) in samples.iter().enumerate().zip(images) {
             let label = Label::of(network, index, sample)?;
+            if label.done && !self.model.says_done() {
+                return Err(Error::Done { index });
+            }
             let warp = if augment {
                 let labels_px = [label.pick_px, label.place_px];
                 Warp::draw(
                     &self.config.augmentation,
                     network.rows,
                     network.cols,
+                    1 + encoding.goals,
                     labels_px,
                     rng,
                 )
@@ -195,23 +205,42 @@ impl Trainer {
                 Warp::identity()
             };
             encode(encoding, sample.observation, sample.goal, &warp, image);
-            labels.push(label.warped(&warp));
+            labels.push(label.warped(&warp, network));
         }
         let input = tensor(encoding, [network.rows, network.cols], &encoded).to_device(self.device);
         let features = self.model.forward(&input);
         let (grid, sigma) = (&self.model.grid, self.config.label_sigma_cells);
-        let pick = pick_loss(grid, sigma, &features, &labels);
-        let loss = self.config.place_loss;
-        let place = place_loss(
-            grid,
-            loss,
-            sigma,
-            network.rotations,
-            &features,
-            &labels,
-            rng,
-        );
-        Ok([pick, place])
+        let to_do = |index: &usize| !labels[*index].done;
+        let to_do: Vec<usize> = (0..labels.len()).filter(to_do).collect();
+        let of = |features: &Features, labels: &[Label], rng: &mut ChaCha8Rng| {
+            let (loss, rotations) = (self.config.place_loss, network.rotations);
+            [
+                pick_loss(grid, sigma, features, labels),
+                place_loss(grid, loss, sigma, rotations, features, labels, rng),
+            ]
+        };
+        let [pick, place] = if to_do.len() == labels.len() {
+            of(&features, &labels, rng)
+        } else if to_do.is_empty() {
+            [features.nothing(), features.nothing()]
+        } else {
+            // A step that is done has no pick: its share of the batch's mean is 0.
+            let indices: Vec<i64> = to_do.iter().map(|index| *index as i64).collect();
+            let chosen: Vec<Label> = to_do.iter().map(|index| labels[*index]).collect();
+            let share = to_do.len() as f64 / labels.len() as f64;
+            of(&features.of(&indices), &chosen, rng).map(|loss| loss * share)
+        };
+        Ok(match &features.first {
+            None => [
+                pick,
+                place,
+                Tensor::zeros([], (features.scale.kind(), self.device)),
+            ],
+            Some(first) => {
+                let place = place + first_place_loss(grid, sigma, first, &labels);
+                [pick, place, done_loss(first, &labels)]
+            }
+        })
     }
 
     /// A policy with a copy of the present weights.

@@ -1,6 +1,9 @@
 //! What a checkpoint must bring back, and which ones are refused.
 
-use gctn::{Compact, ModelCard, Network, NetworkConfig, Policy, Storage, Trainer, TrainingConfig};
+use gctn::{
+    Calibration, Compact, Decision, Goal, GoalConditioning, Matching, ModelCard, Network,
+    NetworkConfig, Policy, Storage, Trainer, TrainingConfig, Verdict,
+};
 use heightmap::{Heightmap, Workspace};
 use nalgebra::Isometry2;
 use safetensors::SafeTensors;
@@ -150,6 +153,99 @@ fn another_grid_and_broken_heightmaps_are_refused() {
         .unwrap_err()
         .to_string();
     assert_eq!(error, "the goal: height at index 5 is not finite");
+}
+
+#[test]
+fn a_network_conditioned_on_a_sequence_wants_the_image_before_the_goal() {
+    let network = NetworkConfig {
+        rows: 32,
+        cols: 32,
+        rotations: 4,
+        conditioning: GoalConditioning::Sequence,
+        ..NetworkConfig::new(Network::Matching(Matching {
+            channels: [4, 4, 8, 8],
+            window_cells: 5,
+            ..Matching::default()
+        }))
+    };
+    let trainer = Trainer::new(&network, &TrainingConfig::compact()).unwrap();
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("model.safetensors");
+    let card = ModelCard::new();
+    trainer.save_checkpoint(&path, Storage::F32, &card).unwrap();
+    let policy = Policy::load(&path).unwrap();
+    assert_eq!(policy.config().conditioning, GoalConditioning::Sequence);
+    let [observation, image] = scene();
+    let decide = |goal: Goal<'_>| policy.decide(&observation, goal, &[]);
+    let error = decide((&image).into()).unwrap_err().to_string();
+    assert_eq!(
+        error,
+        "the network is conditioned on sequence, but the image before the goal is missing"
+    );
+    let decision = decide(Goal::step(&observation, &image)).unwrap();
+    assert!(
+        decision
+            .done
+            .is_some_and(|done| (0.0..=1.0).contains(&done))
+    );
+    let done = policy.done(&observation, Goal::step(&observation, &image));
+    assert_eq!(done.unwrap(), decision.done);
+    // What an older network does not look at changes nothing.
+    let older = self::trainer().policy().unwrap();
+    let without = older.decide(&observation, &image, &[]).unwrap();
+    let with = older.decide(&observation, Goal::step(&observation, &image), &[]);
+    assert_eq!(with.unwrap(), without);
+    assert_eq!(without.done, None);
+}
+
+#[test]
+fn a_calibrated_checkpoint_decides_the_same_and_says_how_likely_it_is() {
+    let (folder, path) = saved(Storage::F16);
+    let calibrated = folder.path().join("calibrated.safetensors");
+    let calibration = Calibration {
+        weights: [0.5, 0.25, 0.125, -1.0],
+        steps: 60,
+    };
+    gctn::calibrate(&path, &calibrated, &calibration).unwrap();
+    let [plain, with] = [path, calibrated].map(|path| Policy::load(&path).unwrap());
+    assert_eq!(
+        (plain.calibration(), with.calibration()),
+        (None, Some(&calibration))
+    );
+    assert_eq!((plain.card(), plain.config()), (with.card(), with.config()));
+    let [observation, goal] = scene();
+    let plain = plain.decide(&observation, &goal, &[]).unwrap();
+    let with = with.decide(&observation, &goal, &[]).unwrap();
+    let success = with.success.unwrap();
+    assert_eq!(success, calibration.probability(&plain.evidence));
+    assert_eq!(
+        with,
+        Decision {
+            success: Some(success),
+            ..plain.clone()
+        }
+    );
+    assert_eq!(with.verdict(success), Verdict::Act);
+    assert_eq!(with.verdict(success + 1e-6), Verdict::Unknown);
+    assert_eq!(plain.verdict(1.0), Verdict::Act);
+    let done = Decision {
+        done: Some(0.9),
+        ..with
+    };
+    assert_eq!(done.verdict(1.0), Verdict::Done);
+}
+
+#[test]
+fn the_matching_network_is_refused_without_a_sequence() {
+    let network = NetworkConfig {
+        conditioning: GoalConditioning::NextStep,
+        ..NetworkConfig::matching()
+    };
+    let error = network.check().unwrap_err().to_string();
+    assert!(
+        error.contains("conditioning is next_step") && error.contains("sequence"),
+        "{error}"
+    );
 }
 
 type Head = BTreeMap<String, String>;

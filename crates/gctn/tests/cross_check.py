@@ -115,8 +115,19 @@ def compact_input(observation, goal):
     return np.concatenate([seen, wanted, change, colour, height])
 
 
-def compact(net, config, x):
-    """Pick logits, query features, key features with their margin, scale."""
+def sequence_input(observation, previous, image):
+    """The 24 channels that the matching network reads."""
+    seen, before, after = (
+        np.concatenate([h["rgb"].transpose(2, 0, 1) / 128 - 1.1, h["height_m"][None] / 0.04])
+        for h in (observation, previous, image)
+    )
+    changes = after - before, after - seen
+    sizes = [part for c in changes for part in (np.abs(c[:3]).mean(0, keepdims=True), np.abs(c[3:]))]
+    return np.concatenate([seen, before, after, *changes, *sizes])
+
+
+def trunk(net, config, x):
+    """The U-Net of the compact and of the matching network."""
 
     def block(name, x):
         return relu(x + net.conv(f"{name}.second", relu(net.conv(f"{name}.first", x))))
@@ -130,6 +141,43 @@ def compact(net, config, x):
     for level in (2, 1, 0):
         x = upsample(net.conv(f"rise{level}.lateral", x)) + skips[level]
         x = block(f"rise{level}.block", x)
+    return x
+
+
+def matching(net, config, x, attention=None):
+    """Pick logits, query features, key features with their margin, scale, first place logits, logit of done, attention.
+
+    The attention is a constant to every gradient: slopes give the one of the case's own weights.
+    """
+    network = config["network"]
+    place_head, bias_head, context_head, key_head, done_head = np.split(relu(net.conv("heads", trunk(net, config, x))), 5)
+    place = net.conv("place", place_head)[0]
+    if attention is None:
+        attention = np.exp(place - log_sum_exp(place))
+
+    def embedded(image):
+        for name in ("first", "second"):
+            image = relu(net.conv(f"embedding.{name}", image, 2 if name == "first" else 1))
+        image = net.conv("embedding.third", image)
+        vectors, features = np.split(image, [network["appearance_channels"]])
+        return vectors / np.linalg.norm(vectors, axis=0), features
+
+    seen, seen_features = embedded(x[0:4])
+    shown, shown_features = embedded(x[8:12])
+    moved = (shown * attention).sum((1, 2))
+    cosine = np.tensordot(moved / np.linalg.norm(moved), seen, 1)
+    pick = net.weights["match_scale"][0] * cosine + net.conv("bias", bias_head)[0]
+    gate = 1 / (1 + np.exp(-net.conv("gate", key_head)))
+    query = np.concatenate([seen_features, net.conv("query", context_head)])
+    key = np.concatenate([shown_features * gate, net.conv("key", key_head)])
+    margin = network["window_cells"] // 2
+    done = (net.conv("done", done_head)[0] * attention).sum()
+    return pick, query, pad(key, margin, margin), net.weights["scale"][0], place, done, attention
+
+
+def compact(net, config, x):
+    """Pick logits, query features, key features with their margin, scale."""
+    x = trunk(net, config, x)
     heads = np.split(relu(net.conv("heads", x)), 3)
     pick, query, key = (net.conv(name, head) for name, head in zip(("pick", "query", "key"), heads, strict=False))
     margin = config["network"]["window_cells"] // 2
@@ -189,11 +237,13 @@ class Case:
         self.case = json.loads((folder / "case.json").read_text())
         self.tensors = read_safetensors(folder / "case.safetensors")
         self.config = self.case["network"]
-        self.compact = self.config["network"]["kind"] == "compact"
+        self.kind = self.config["network"]["kind"]
+        self.compact = self.kind in ("compact", "matching")
         self.stride = 2 if self.compact else 1
         self.rows = self.config["rows"] // self.stride
         self.cols = self.config["cols"] // self.stride
         self.weights = self.named("weight")
+        self.attention = None
 
     def named(self, prefix):
         prefix += "/"
@@ -221,10 +271,17 @@ class Case:
         """Pick logits, place logits by rotation, and the two losses."""
         observation, goal = self.named("observation"), self.named("goal")
         net = Net(weights)
+        first = None
         if self.compact:
             # Images are encoded in 32 bits; from there on the two must agree to the last digits.
-            compare("input", compact_input(observation, goal), self.tensors["input"], 1e-6, quiet=True)
-            pick, query, key, scale = compact(net, self.config, self.tensors["input"])
+            if self.kind == "matching":
+                read = sequence_input(observation, self.named("last"), goal)
+                read_by = self.tensors["input"], self.attention
+                pick, query, key, scale, first, done, self.attention = matching(net, self.config, *read_by)
+            else:
+                read = compact_input(observation, goal)
+                pick, query, key, scale = compact(net, self.config, self.tensors["input"])
+            compare("input", read, self.tensors["input"], 1e-6, quiet=True)
         else:
             pick, query, key, scale = published(net, self.config, observation, goal)
         network, rotations = self.config["network"], self.config["rotations"]
@@ -236,7 +293,8 @@ class Case:
         cheap = self.case["place_loss"] == "right_and_one_wrong"
         kernels = [window(query, center, 2 * np.pi * r / rotations, size, bilinear) for r in range(rotations)]
         wanted = range(rotations) if all_rotations or not cheap else (right, wrong)
-        place = {r: scale * correlation(key, kernels[r], self.rows, self.cols) for r in wanted}
+        before = 0.0 if first is None else first
+        place = {r: before + scale * correlation(key, kernels[r], self.rows, self.cols) for r in wanted}
 
         pick_loss = log_sum_exp(pick) - (self.target(self.case["pick_px"]) * pick).sum()
         covered = (self.target(self.case["place_px"]) * place[right]).sum()
@@ -248,7 +306,11 @@ class Case:
             place_loss += log_sum_exp(np.stack([place[right], place[wrong]])) - covered
         else:
             place_loss = log_sum_exp(np.stack([place[r] for r in range(rotations)])) - covered
-        return pick, place, np.array([pick_loss, place_loss])
+        losses = [pick_loss, place_loss]
+        if first is not None:
+            losses.append(log_sum_exp(first) - (self.target(self.case["place_px"]) * first).sum())
+            losses.append(np.log1p(np.exp(done)))
+        return pick, place, np.array(losses)
 
     def slope(self, direction):
         """How the sum of the losses changes along a direction in weights."""

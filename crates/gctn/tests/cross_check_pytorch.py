@@ -126,6 +126,31 @@ def shared(net, config, x):
     return pick[0], query, F.pad(key, (margin,) * 4), net.weights["scale"]
 
 
+def matching(net, config, x):
+    """As `shared`, and first place logits, logit of done."""
+    network = config["network"]
+    heads = F.relu(net.conv("heads", compact_trunk(net, config, x))).chunk(5, 1)
+    place, bias, query, key = (net.conv(name, head) for name, head in zip(("place", "bias", "query", "key"), heads))
+    gate, done = torch.sigmoid(net.conv("gate", heads[3])), net.conv("done", heads[4])[0, 0]
+    place = place[0, 0]
+    attention = torch.softmax(place.detach().flatten(), 0).view_as(place)
+
+    def embedded(image):
+        image = F.relu(net.conv("embedding.first", image, 2))
+        image = net.conv("embedding.third", F.relu(net.conv("embedding.second", image)))[0]
+        vectors, features = image.split([network["appearance_channels"], network["feature_channels"]])
+        return F.normalize(vectors, dim=0), features
+
+    seen, seen_features = embedded(x[:, 0:4])
+    shown, shown_features = embedded(x[:, 8:12])
+    moved = F.normalize((shown * attention).sum((1, 2)), dim=0)
+    pick = net.weights["match_scale"] * torch.einsum("c,cij->ij", moved, seen) + bias[0, 0]
+    query = torch.cat([seen_features, query[0]])
+    key = torch.cat([shown_features * gate[0], key[0]])
+    margin = network["window_cells"] // 2
+    return pick, query, F.pad(key, (margin,) * 4), net.weights["scale"], place, (done * attention).sum()
+
+
 def cells(features, rows, cols):
     """The features of cells, zero outside."""
     inside = (rows >= 0) & (rows < features.shape[1]) & (cols >= 0) & (cols < features.shape[2])
@@ -170,7 +195,8 @@ class Case:
             assert stored == self.config, "the checkpoint is of another network"
         for x in self.weights.values():
             x.requires_grad_(self.case["slopes"])
-        self.shared = self.config["network"]["kind"] in TRUNKS
+        self.matching = self.config["network"]["kind"] == "matching"
+        self.shared = self.matching or self.config["network"]["kind"] in TRUNKS
         self.stride = 2 if self.shared else 1
         self.rows = self.config["rows"] // self.stride
         self.cols = self.config["cols"] // self.stride
@@ -203,7 +229,12 @@ class Case:
     def run(self):
         """Pick logits, place logits of every rotation, and the two losses."""
         net = Net(self.weights)
-        if self.shared:
+        first = done = None
+        if self.matching:
+            read = self.tensors["input"].to(self.kind)[None]
+            pick, query, key, scale, first, done = matching(net, self.config, read)
+            first, done = first.double(), done.double()
+        elif self.shared:
             pick, query, key, scale = shared(net, self.config, self.tensors["input"].to(self.kind)[None])
         else:
             images = [{name: x.to(self.kind) for name, x in self.named(of).items()} for of in self.images()]
@@ -218,6 +249,8 @@ class Case:
         right, wrong = self.case["rotation"], self.case["wrong_rotation"]
         kernels = torch.stack([window(query, center, 2 * math.pi * r / rotations, size, bilinear) for r in range(rotations)])
         place = scale * F.conv2d(key[None], kernels)[0, :, : self.rows, : self.cols]
+        if first is not None:
+            place = place + first
 
         def log_sum_exp(x):
             return torch.logsumexp(x.flatten(), 0)
@@ -232,7 +265,11 @@ class Case:
             place_loss = place_loss + log_sum_exp(place[[right, wrong]]) - covered
         else:
             place_loss = log_sum_exp(place) - covered
-        return pick, place, torch.stack([pick_loss, place_loss])
+        losses = [pick_loss, place_loss]
+        if first is not None:
+            losses.append(log_sum_exp(first) - (self.target(self.case["place_px"]) * first).sum())
+            losses.append(F.softplus(done))
+        return pick, place, torch.stack(losses)
 
 
 def compare(what, ours, theirs, tolerance):

@@ -56,6 +56,54 @@ fn a_toy_is_learned_in_seconds() {
     );
 }
 
+#[test]
+fn a_step_shown_from_another_start_is_learned_in_seconds() {
+    const ROTATIONS: u32 = 4;
+    let network = NetworkConfig {
+        rotations: ROTATIONS as usize,
+        ..NetworkConfig::matching()
+    };
+    let training = TrainingConfig {
+        steps: 150,
+        warm_up_steps: 10,
+        ..TrainingConfig::compact()
+    };
+    let scenes: Vec<Toy> = (0..100).map(|seed| Toy::new(seed, ROTATIONS)).collect();
+    let mut trainer = Trainer::new(&network, &training).unwrap();
+    for step in 0..training.steps as usize {
+        let samples: Vec<_> = (0..training.batch)
+            .map(|index| {
+                let scene = &scenes[(step * training.batch + index) % scenes.len()];
+                match index {
+                    // Seen after the step: it is done.
+                    0 => Sample {
+                        observation: &scene.goal,
+                        done: true,
+                        ..scene.shown_elsewhere()
+                    },
+                    _ => scene.shown_elsewhere(),
+                }
+            })
+            .collect();
+        trainer.train_step(&samples).unwrap();
+    }
+    let policy = trainer.policy().unwrap();
+    let (mut picked, mut placed, mut judged) = (0, 0, 0);
+    for scene in (10_000..10_020).map(|seed| Toy::new(seed, ROTATIONS)) {
+        let goal = scene.shown_elsewhere().goal;
+        let decision = policy.decide(&scene.observation, goal, &[]).unwrap();
+        let error = scene.error(&decision);
+        picked += usize::from(error.is_some());
+        placed += usize::from(error.is_some_and(|(distance_m, _)| distance_m < 0.006));
+        let after = policy.decide(&scene.goal, goal, &[]).unwrap();
+        judged += usize::from(decision.done < Some(0.5) && after.done > Some(0.5));
+    }
+    assert!(
+        picked >= 17 && placed >= 15 && judged >= 15,
+        "of 20 scenes {picked} picked, {placed} placed, {judged} judged"
+    );
+}
+
 /// A grid so small that a step takes milliseconds.
 fn small_workspace() -> Workspace {
     Workspace {
@@ -107,6 +155,7 @@ fn sample<'a>(observation: &'a Heightmap, goal: &'a Heightmap) -> Sample<'a> {
         goal: goal.into(),
         pick: Isometry2::new(corner + Vector2::new(0.03, 0.05), 0.0),
         place: Isometry2::new(corner + Vector2::new(0.06, 0.11), 2.0),
+        done: false,
     }
 }
 

@@ -1,6 +1,6 @@
 //! The one documented place for SE(2) <-> pixel.
 
-use nalgebra::{Isometry2, Point2, Vector2};
+use nalgebra::{Isometry2, Point2};
 use serde::{Deserialize, Serialize};
 
 /// The volume above the table that a heightmap covers, and its grid.
@@ -95,7 +95,7 @@ impl Workspace {
 
     /// The cell that holds a point, if the point is on the grid.
     pub fn pixel(&self, point: &Point2<f64>) -> Option<Pixel> {
-        let cell = (point - self.origin_m) / self.pixel_size_m;
+        let cell = self.point_px(point);
         let (col, row) = (cell.x.floor(), cell.y.floor());
         // NaN fails both comparisons.
         let inside = col >= 0.0 && row >= 0.0 && col < self.cols as f64 && row < self.rows as f64;
@@ -105,10 +105,20 @@ impl Workspace {
         })
     }
 
+    /// Continuous image coordinates of a world position: x along columns, y along rows, in cells from the outer
+    /// corner of cell (0, 0). Defined off the grid too.
+    pub fn point_px(&self, point: &Point2<f64>) -> Point2<f64> {
+        Point2::from((point - self.origin_m) / self.pixel_size_m)
+    }
+
+    /// World position of continuous image coordinates, see [`Self::point_px`].
+    pub fn point_m(&self, point_px: &Point2<f64>) -> Point2<f64> {
+        self.origin_m + point_px.coords * self.pixel_size_m
+    }
+
     /// World position of a cell's centre.
     pub fn center(&self, pixel: Pixel) -> Point2<f64> {
-        let cell = Vector2::new(pixel.col as f64 + 0.5, pixel.row as f64 + 0.5);
-        self.origin_m + cell * self.pixel_size_m
+        self.point_m(&Point2::new(pixel.col as f64 + 0.5, pixel.row as f64 + 0.5))
     }
 
     /// The SE(2) pose at a cell's centre; yaw turns +x towards +y, that is columns towards rows.

@@ -129,6 +129,7 @@ fn score(map: &ScoreMap, row: usize, col: usize, rows: usize, cols: usize) -> f3
 #[cfg(test)]
 mod tests {
     use super::*;
+    use gctn::Evidence;
     use std::f64::consts::FRAC_PI_2;
 
     use heightmap::Workspace;
@@ -145,6 +146,13 @@ mod tests {
             }
         };
         Decision {
+            done: None,
+            success: None,
+            evidence: Evidence {
+                pick: 0.0,
+                place: 0.0,
+                done: 0.0,
+            },
             pick: Isometry2::new(Vector2::new(0.3, -0.4), 0.0),
             place: Isometry2::new(Vector2::new(0.7, 0.4), FRAC_PI_2),
             pick_score: 1.0,

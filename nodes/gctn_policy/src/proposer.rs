@@ -348,7 +348,7 @@ impl Fnv1a {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use gctn::ScoreMap;
+    use gctn::{Evidence, ScoreMap};
     use heightmap::Workspace;
     use msgs::sctn_msgs::PrimitiveSettings;
     use nalgebra::Vector2;
@@ -397,6 +397,13 @@ mod tests {
             scores: vec![1.0],
         };
         Decision {
+            done: None,
+            success: None,
+            evidence: Evidence {
+                pick: 0.0,
+                place: 0.0,
+                done: 0.0,
+            },
             pick: Isometry2::new(Vector2::new(x, 0.1), 0.0),
             place: Isometry2::new(Vector2::new(0.5, -0.1), 1.0),
             pick_score: 0.9,

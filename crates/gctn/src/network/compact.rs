@@ -15,18 +15,23 @@ struct Rise {
     block: Block,
 }
 
+/// A U-Net from full to half resolution.
 #[derive(Debug)]
-pub(super) struct CompactNet {
+pub(super) struct UNet {
     encoder: Encoder,
     /// From the coarsest to the finest.
     rises: Vec<Rise>,
-    heads: Heads,
 }
 
-impl CompactNet {
-    pub fn new(config: &Compact, inputs: usize, builder: &mut Builder) -> Self {
-        let channels = config.channels;
-        let encoder = Encoder::new(inputs, &channels, &config.blocks, builder);
+impl UNet {
+    /// With these channels and residual blocks at strides 2, 4, 8 and 16.
+    pub fn new(
+        inputs: usize,
+        channels: [usize; 4],
+        blocks: &[usize; 4],
+        builder: &mut Builder,
+    ) -> Self {
+        let encoder = Encoder::new(inputs, &channels, blocks, builder);
         let rises = (0..channels.len() - 1)
             .rev()
             .map(|level| {
@@ -43,11 +48,32 @@ impl CompactNet {
                 }
             })
             .collect();
+        Self { encoder, rises }
+    }
+
+    /// As many channels as at stride 2.
+    pub fn forward(&self, input: &Tensor) -> Tensor {
+        let (mut x, skips) = self.encoder.forward(input);
+        for (rise, skip) in self.rises.iter().zip(skips.iter().rev()) {
+            x = upsample(&rise.lateral.forward(&x)) + skip;
+            x = rise.block.forward(&x);
+        }
+        x
+    }
+}
+
+#[derive(Debug)]
+pub(super) struct CompactNet {
+    trunk: UNet,
+    heads: Heads,
+}
+
+impl CompactNet {
+    pub fn new(config: &Compact, inputs: usize, builder: &mut Builder) -> Self {
         Self {
-            encoder,
-            rises,
+            trunk: UNet::new(inputs, config.channels, &config.blocks, builder),
             heads: Heads::new(
-                channels[0],
+                config.channels[0],
                 config.feature_channels,
                 config.window_cells,
                 builder,
@@ -56,11 +82,7 @@ impl CompactNet {
     }
 
     pub fn forward(&self, input: &Tensor, kind: Kind) -> Features {
-        let (mut x, skips) = self.encoder.forward(&input.to_kind(kind));
-        for (rise, skip) in self.rises.iter().zip(skips.iter().rev()) {
-            x = upsample(&rise.lateral.forward(&x)) + skip;
-            x = rise.block.forward(&x);
-        }
+        let x = self.trunk.forward(&input.to_kind(kind));
         self.heads.forward(&x, input.kind())
     }
 }

@@ -14,9 +14,9 @@ use tch::{Device, Kind, Tensor};
 use super::{Builder, Model};
 use crate::augment::Warp;
 use crate::input::{Label, encode, tensor};
-use crate::losses::{pick_loss, place_logits, place_loss};
+use crate::losses::{done_loss, first_place_loss, pick_loss, place_logits, place_loss};
 use crate::{Compact, ModelCard, Network, NetworkConfig, PlaceLoss, Precision, Resnet43, Storage};
-use crate::{Goal, GoalConditioning, GrConvnet, Interpolation, checkpoint};
+use crate::{Goal, GoalConditioning, GrConvnet, Interpolation, Matching, checkpoint};
 
 /// Who checks.
 #[derive(Clone, Copy, Debug)]
@@ -89,10 +89,10 @@ fn check(
     flat += Tensor::from_slice(&noise).to_kind(flat.kind());
 
     let [observation, goal, last] = [(); 3].map(|()| scene(config, rng));
-    let both = config.conditioning == GoalConditioning::Both;
     let shown = Goal {
         image: &goal,
-        last: both.then_some(&last),
+        last: (config.conditioning == GoalConditioning::Both).then_some(&last),
+        previous: (config.conditioning == GoalConditioning::Sequence).then_some(&last),
     };
     let encoding = model.encoding();
     let mut encoded = vec![0.0; encoding.channels() * observation.workspace.len()];
@@ -114,6 +114,7 @@ fn check(
             0.3 * config.rows as f64 + 0.05,
         ),
         rotation: 3,
+        done: false,
     };
     let wrong = (label.rotation + ChaCha8Rng::seed_from_u64(7).random_range(1..config.rotations))
         % config.rotations;
@@ -130,7 +131,7 @@ fn check(
             config.rotations,
         )
     });
-    let losses = [
+    let mut losses = vec![
         pick_loss(&model.grid, sigma_cells, &features, &[label]),
         place_loss(
             &model.grid,
@@ -142,9 +143,14 @@ fn check(
             &mut ChaCha8Rng::seed_from_u64(7),
         ),
     ];
+    if let Some(first) = &features.first {
+        losses.push(first_place_loss(&model.grid, sigma_cells, first, &[label]));
+        losses.push(done_loss(first, &[label]));
+    }
     // In 32 bits only the values are checked, and the weights are read from a checkpoint.
     let gradients = if double {
-        Tensor::run_backward(&[&losses[0] + &losses[1]], &weights, false, false)
+        let sum = Tensor::stack(&losses, 0).sum(None::<Kind>);
+        Tensor::run_backward(&[sum], &weights, false, false)
     } else {
         Vec::new()
     };
@@ -179,11 +185,11 @@ fn check(
         features.pick.detach().squeeze_dim(0),
     ));
     tensors.push(("expected/place".into(), place.squeeze_dim(0)));
-    let [pick_loss, place_loss] = losses.map(|loss| loss.double_value(&[]));
+    let losses: Vec<f64> = losses.iter().map(|loss| loss.double_value(&[])).collect();
     let case = json!({
         "network": config, "sigma_cells": sigma_cells, "place_loss": loss, "tolerance": tolerance,
         "slopes": double, "pick_px": label.pick_px, "place_px": label.place_px, "rotation": label.rotation,
-        "wrong_rotation": wrong, "expected_losses": [pick_loss, place_loss],
+        "wrong_rotation": wrong, "expected_losses": losses,
     });
     std::fs::write(folder.path().join("case.json"), case.to_string()).unwrap();
     write(&folder.path().join("case.safetensors"), &tensors);
@@ -243,6 +249,54 @@ fn the_compact_network_is_what_they_say(judge: Judge) {
     for loss in [PlaceLoss::AllRotations, PlaceLoss::RightAndOneWrong] {
         check(judge, &config, true, loss, 0.7, 1e-9);
     }
+}
+
+fn the_matching_network_is_what_they_say(judge: Judge) {
+    let config = NetworkConfig {
+        conditioning: GoalConditioning::Sequence,
+        ..small(Network::Matching(Matching {
+            channels: [6, 8, 12, 16],
+            hidden_channels: 5,
+            appearance_channels: 4,
+            feature_channels: 3,
+            context_channels: 2,
+            window_cells: 9,
+            ..Matching::default()
+        }))
+    };
+    for loss in [PlaceLoss::AllRotations, PlaceLoss::RightAndOneWrong] {
+        check(judge, &config, true, loss, 0.7, 1e-9);
+    }
+}
+
+fn the_matching_network_in_full_size_and_32_bits_is_what_they_say(judge: Judge) {
+    let config = NetworkConfig::matching();
+    let loss = PlaceLoss::RightAndOneWrong;
+    check(judge, &config, false, loss, 0.7, 1e-5);
+}
+
+#[test]
+#[ignore = "needs numpy: cargo xtask test runs it"]
+fn the_matching_network_is_what_numpy_says() {
+    the_matching_network_is_what_they_say(Judge::Numpy);
+}
+
+#[test]
+#[ignore = "needs numpy: cargo xtask test runs it"]
+fn the_matching_network_in_full_size_and_32_bits_is_what_numpy_says() {
+    the_matching_network_in_full_size_and_32_bits_is_what_they_say(Judge::Numpy);
+}
+
+#[test]
+#[ignore = "needs PyTorch: cargo xtask test runs it where there is one"]
+fn the_matching_network_and_its_gradients_are_what_pytorch_says() {
+    the_matching_network_is_what_they_say(Judge::PyTorch);
+}
+
+#[test]
+#[ignore = "needs PyTorch: cargo xtask test runs it where there is one"]
+fn the_matching_network_in_full_size_and_32_bits_is_what_pytorch_says() {
+    the_matching_network_in_full_size_and_32_bits_is_what_they_say(Judge::PyTorch);
 }
 
 fn the_published_network_is_what_they_say(judge: Judge) {

@@ -72,6 +72,7 @@ impl Heads {
             query: head(1, &self.query),
             key: head(2, &self.key).constant_pad_nd([self.margin; 4]),
             scale: self.scale.shallow_clone(),
+            first: None,
         }
     }
 }

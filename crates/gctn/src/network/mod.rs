@@ -6,6 +6,7 @@ mod cross_check;
 mod encoder;
 mod gr_convnet;
 mod heads;
+mod matching;
 mod parameters;
 mod resnet43;
 
@@ -15,6 +16,7 @@ use crate::input::{Encoding, Reading};
 use crate::{Interpolation, Network, NetworkConfig, Precision};
 use compact::CompactNet;
 use gr_convnet::GrConvnetNet;
+use matching::MatchingNet;
 use resnet43::Resnet43Nets;
 
 pub(crate) use encoder::Encoder;
@@ -30,6 +32,41 @@ pub(crate) struct Features {
     pub key: Tensor,
     /// Factor from correlation to logit.
     pub scale: Tensor,
+    /// What a network says that finds the place first.
+    pub first: Option<FirstPlace>,
+}
+
+/// What is said of the place before the pick is known.
+pub(crate) struct FirstPlace {
+    /// Place logits, N x rows x cols of the grid, whatever the pick and the turn: added to what the correlation says.
+    pub place: Tensor,
+    /// Logit that the step is done already, N.
+    pub done: Tensor,
+}
+
+impl Features {
+    /// Those of some samples only.
+    pub fn of(&self, samples: &[i64]) -> Self {
+        let samples = Tensor::from_slice(samples).to_device(self.pick.device());
+        let of = |tensor: &Tensor| tensor.index_select(0, &samples);
+        Self {
+            pick: of(&self.pick),
+            query: of(&self.query),
+            key: of(&self.key),
+            scale: self.scale.shallow_clone(),
+            first: self.first.as_ref().map(|first| FirstPlace {
+                place: of(&first.place),
+                done: of(&first.done),
+            }),
+        }
+    }
+
+    /// 0, however the weights change: a loss where there is nothing to learn from.
+    pub fn nothing(&self) -> Tensor {
+        let sum = |tensor: &Tensor| tensor.sum(None::<Kind>);
+        let sums = sum(&self.pick) + sum(&self.query) + sum(&self.key) + sum(&self.scale);
+        sums * 0.0
+    }
 }
 
 /// The grid of a network's output, and its query window.
@@ -70,6 +107,7 @@ enum Nets {
     Compact(CompactNet),
     GrConvnet(GrConvnetNet),
     Resnet43(Resnet43Nets),
+    Matching(MatchingNet),
 }
 
 /// A network with its weights.
@@ -90,6 +128,7 @@ impl Model {
             reading: match config.network {
                 Network::Resnet43(_) => Reading::Raw,
                 Network::Compact(_) | Network::GrConvnet(_) => Reading::Difference,
+                Network::Matching(_) => Reading::Sequence,
             },
             goals: config.conditioning.images(),
         };
@@ -113,6 +152,10 @@ impl Model {
             Network::GrConvnet(gr_convnet) => (
                 Nets::GrConvnet(GrConvnetNet::new(gr_convnet, inputs, &mut builder)),
                 half(gr_convnet.window_cells, gr_convnet.rotation_sampling),
+            ),
+            Network::Matching(matching) => (
+                Nets::Matching(MatchingNet::new(matching, inputs, &mut builder)),
+                half(matching.window_cells, matching.rotation_sampling),
             ),
             Network::Resnet43(resnet43) => {
                 let grid = Grid {
@@ -141,6 +184,11 @@ impl Model {
         }
     }
 
+    /// Whether the network says if a step is done.
+    pub fn says_done(&self) -> bool {
+        matches!(self.nets, Nets::Matching(_))
+    }
+
     /// What the network reads.
     pub fn encoding(&self) -> Encoding {
         self.encoding
@@ -157,6 +205,7 @@ impl Model {
             Nets::Compact(net) => net.forward(&input, kind),
             Nets::GrConvnet(net) => net.forward(&input, kind),
             Nets::Resnet43(nets) => nets.forward(&input, kind),
+            Nets::Matching(net) => net.forward(&input, kind),
         }
     }
 }

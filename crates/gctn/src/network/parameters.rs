@@ -165,6 +165,11 @@ impl Conv {
     }
 }
 
+/// The same numbers, channels last in memory, as convolutions like it.
+pub(crate) fn channels_last(x: &Tensor) -> Tensor {
+    x.permute([0, 2, 3, 1]).contiguous().permute([0, 3, 1, 2])
+}
+
 /// Twice as many rows and columns, bilinear between the centres of cells.
 pub(crate) fn upsample(x: &Tensor) -> Tensor {
     let size = x.size();

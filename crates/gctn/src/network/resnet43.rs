@@ -3,7 +3,7 @@
 use tch::{Kind, Tensor};
 
 use super::Features;
-use super::parameters::{Builder, Conv, Init, upsample};
+use super::parameters::{Builder, Conv, Init, channels_last, upsample};
 use crate::Resnet43;
 
 /// 1x1, 3x3, 1x1 beside a shortcut, which is a convolution where size or channels change.
@@ -116,10 +116,6 @@ fn normalise(x: &Tensor) -> Tensor {
     Tensor::cat(&[&colour, &height, &height, &height], 1)
 }
 
-fn channels_last(x: &Tensor) -> Tensor {
-    x.permute([0, 2, 3, 1]).contiguous().permute([0, 3, 1, 2])
-}
-
 impl Resnet43Nets {
     pub fn new(config: &Resnet43, goals: usize, builder: &mut Builder) -> Self {
         let features = config.feature_channels;
@@ -169,6 +165,7 @@ impl Resnet43Nets {
             query,
             key,
             scale: Tensor::full([1], area.recip(), (input.kind(), input.device())),
+            first: None,
         }
     }
 }

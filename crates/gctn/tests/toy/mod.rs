@@ -2,7 +2,7 @@
 //! elsewhere and turned.
 #![allow(dead_code)] // Test and example use different parts.
 
-use gctn::{Decision, Sample};
+use gctn::{Decision, Goal, Sample};
 use heightmap::{Heightmap, Pixel, Workspace};
 use nalgebra::{Isometry2, Point2, Vector2};
 use rand::{Rng, RngExt};
@@ -23,6 +23,8 @@ const COLOURS: [[u8; 3]; 6] = [
 pub struct Toy {
     pub observation: Heightmap,
     pub goal: Heightmap,
+    /// v_{k-1} and v_k of a demonstration of another start.
+    pub shown: [Heightmap; 2],
     pub pick: Isometry2<f64>,
     pub place: Isometry2<f64>,
     /// The block to move: where it lies, and where the goal shows it.
@@ -54,6 +56,26 @@ impl Toy {
         let observation = render(&before, rng);
         before[0].0 = wanted;
         let goal = render(&before, rng);
+        // The other start: the same blocks, but only the wanted pose is the same.
+        let other_rng = &mut ChaCha8Rng::seed_from_u64(seed);
+        other_rng.set_stream(1);
+        let mut elsewhere: Vec<_> = before.clone();
+        let mut others: Vec<Isometry2<f64>> = vec![wanted];
+        while others.len() < 5 {
+            let (x, y) = (0.30..0.70, -0.44..0.44);
+            let position = Vector2::new(other_rng.random_range(x), other_rng.random_range(y));
+            let far =
+                |pose: &Isometry2<f64>| (pose.translation.vector - position).norm() > 1.6 * EDGE_M;
+            if others.iter().all(far) {
+                others.push(Isometry2::new(position, other_rng.random_range(0.0..TAU)));
+            }
+        }
+        for (block, pose) in elsewhere.iter_mut().zip(&others[1..]) {
+            block.0 = *pose;
+        }
+        let first_image = render(&elsewhere, other_rng);
+        elsewhere[0].0 = wanted;
+        let shown = [first_image, render(&elsewhere, other_rng)];
         let mut inside = || rng.random_range(-0.35 * EDGE_M..0.35 * EDGE_M);
         let point = Point2::new(inside(), inside());
         let pick = Isometry2::new((block * point).coords, 0.0);
@@ -61,6 +83,7 @@ impl Toy {
         Self {
             observation,
             goal,
+            shown,
             pick,
             place,
             block,
@@ -74,6 +97,16 @@ impl Toy {
             goal: (&self.goal).into(),
             pick: self.pick,
             place: self.place,
+            done: false,
+        }
+    }
+
+    /// The same step, shown by the demonstration of another start: the blocks that stay stand elsewhere, and so does the one
+    /// that moves.
+    pub fn shown_elsewhere(&self) -> Sample<'_> {
+        Sample {
+            goal: Goal::step(&self.shown[0], &self.shown[1]),
+            ..self.sample()
         }
     }
 

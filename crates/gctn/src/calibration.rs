@@ -1,0 +1,208 @@
+//! How likely a decision is to earn its step: a logistic model of what the network says of it, fitted on steps that were
+//! carried out and stored with the checkpoint.
+
+use serde::{Deserialize, Serialize};
+
+use crate::{Decision, Error, ScoreMap};
+
+/// Scores within this distance of a decision's poses count for it.
+const NEAR_PX: f64 = 4.0;
+/// The least score that has a logarithm here.
+const LEAST: f64 = 1e-6;
+
+/// What a network says of its own decision, as numbers that a [`Calibration`] weighs.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+pub struct Evidence {
+    /// Logarithm of the probability of picking within 4 cells of the heightmap of the pick.
+    pub pick: f64,
+    /// Logarithm of the probability of placing, turned as decided, within 4 cells of the place.
+    pub place: f64,
+    /// Logarithm of the odds that the step is done already, from -12 to 12; 0 of a network that does not say so.
+    pub done: f64,
+}
+
+impl Evidence {
+    /// Of a decision. Poses in continuous image coordinates, as (x, y).
+    pub(crate) fn new(
+        pick: (&ScoreMap, [f64; 2]),
+        place: (&ScoreMap, [f64; 2]),
+        stride: usize,
+        done: Option<f64>,
+    ) -> Self {
+        let near = |(map, at): (&ScoreMap, [f64; 2])| {
+            let scores = map.scores.iter().enumerate().filter(|(index, _)| {
+                let center = |index: usize| (index as f64 + 0.5) * stride as f64;
+                let (x, y) = (center(index % map.cols), center(index / map.cols));
+                (x - at[0]).hypot(y - at[1]) <= NEAR_PX
+            });
+            let sum: f64 = scores.map(|(_, score)| f64::from(*score)).sum();
+            sum.clamp(LEAST, 1.0).ln()
+        };
+        const MOST_ODDS: f64 = 12.0;
+        let odds = |share: f64| (share / (1.0 - share)).ln().clamp(-MOST_ODDS, MOST_ODDS);
+        Self {
+            pick: near(pick),
+            place: near(place),
+            done: done.map_or(0.0, odds),
+        }
+    }
+
+    fn features(&self) -> [f64; FEATURES] {
+        [1.0, self.pick, self.place, self.done]
+    }
+}
+
+const FEATURES: usize = 4;
+
+/// Logistic regression from [`Evidence`] to the probability that a step earns its reward (Platt, 1999).
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Calibration {
+    /// Constant, then weights of pick, place and done.
+    pub weights: [f64; FEATURES],
+    /// Steps that it was fitted on.
+    pub steps: usize,
+}
+
+/// Fewest steps, and fewest of either outcome, that a calibration is fitted on.
+const LEAST_STEPS: usize = 50;
+const LEAST_OF_EACH: usize = 5;
+
+impl Calibration {
+    /// Fits to steps that were carried out and whether each earned a reward: the largest likelihood, with a weak pull of the
+    /// weights towards 0, by Newton's method.
+    pub fn fit(steps: &[(Evidence, bool)]) -> Result<Self, Error> {
+        let earned = steps.iter().filter(|(_, earned)| *earned).count();
+        if steps.len() < LEAST_STEPS || earned.min(steps.len() - earned) < LEAST_OF_EACH {
+            return Err(Error::Config {
+                what: "steps of a calibration",
+                actual: format!("{} of which {earned} earned a reward", steps.len()),
+                expected: "at least 50, at least 5 with a reward and 5 without",
+            });
+        }
+        const PULL: f64 = 1e-2;
+        const ROUNDS: usize = 100;
+        let mut weights = nalgebra::SVector::<f64, FEATURES>::zeros();
+        for _ in 0..ROUNDS {
+            let mut slope = -PULL * weights;
+            let mut curvature = nalgebra::SMatrix::<f64, FEATURES, FEATURES>::identity() * PULL;
+            for (evidence, earned) in steps {
+                let features = nalgebra::SVector::from(evidence.features());
+                let probability = logistic(weights.dot(&features));
+                slope += features * (f64::from(u8::from(*earned)) - probability);
+                curvature += features * features.transpose() * probability * (1.0 - probability);
+            }
+            // The pull keeps the curvature positive.
+            let Some(inverse) = curvature.try_inverse() else {
+                break;
+            };
+            // A whole step may go too far where all is nearly certain.
+            const FARTHEST: f64 = 2.0;
+            let step = (inverse * slope).cap_magnitude(FARTHEST);
+            weights += step;
+            if step.norm() < 1e-9 {
+                break;
+            }
+        }
+        Ok(Self {
+            weights: weights.into(),
+            steps: steps.len(),
+        })
+    }
+
+    /// Probability that the step earns its reward.
+    pub fn probability(&self, evidence: &Evidence) -> f64 {
+        let terms = self.weights.iter().zip(evidence.features());
+        logistic(terms.map(|(weight, feature)| weight * feature).sum())
+    }
+}
+
+fn logistic(odds: f64) -> f64 {
+    (1.0 + (-odds).exp()).recip()
+}
+
+/// What to do with a decision.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Verdict {
+    /// Propose it.
+    Act,
+    /// The step is done already: there is nothing to do.
+    Done,
+    /// It is too likely to earn nothing: ask a person.
+    Unknown,
+}
+
+impl Decision {
+    /// The verdict on this decision. `unknown_below` is the probability of success below which the answer is "I do not know"; a
+    /// checkpoint without a calibration is never asked.
+    pub fn verdict(&self, unknown_below: f64) -> Verdict {
+        match (self.done, self.success) {
+            (Some(done), _) if done > 0.5 => Verdict::Done,
+            (_, Some(success)) if success < unknown_below => Verdict::Unknown,
+            _ => Verdict::Act,
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use rand::RngExt;
+    use rand_chacha::{ChaCha8Rng, rand_core::SeedableRng};
+
+    #[test]
+    fn a_fit_finds_the_probabilities_that_made_the_outcomes() {
+        let made = Calibration {
+            weights: [1.5, 2.0, 0.7, -0.4],
+            steps: 0,
+        };
+        let mut rng = ChaCha8Rng::seed_from_u64(1);
+        let steps: Vec<(Evidence, bool)> = (0..20_000)
+            .map(|_| {
+                let evidence = Evidence {
+                    pick: rng.random_range(-3.0..0.0),
+                    place: rng.random_range(-3.0..0.0),
+                    done: rng.random_range(-5.0..5.0),
+                };
+                (evidence, rng.random::<f64>() < made.probability(&evidence))
+            })
+            .collect();
+        let found = Calibration::fit(&steps).unwrap();
+        for (found, made) in found.weights.iter().zip(made.weights) {
+            assert!((found - made).abs() < 0.15, "{found} for {made}");
+        }
+        assert_eq!(found.steps, 20_000);
+    }
+
+    #[test]
+    fn outcomes_that_are_all_alike_are_no_calibration() {
+        let evidence = Evidence {
+            pick: -1.0,
+            place: -1.0,
+            done: 0.0,
+        };
+        let error = Calibration::fit(&vec![(evidence, true); 100]).unwrap_err();
+        assert!(error.to_string().contains("100 of which 100"), "{error}");
+    }
+
+    #[test]
+    fn what_separates_perfectly_stays_finite() {
+        let steps: Vec<_> = (0..100)
+            .map(|index| {
+                let good = index % 2 == 0;
+                let pick = if good { -0.01 } else { -5.0 };
+                let evidence = Evidence {
+                    pick,
+                    place: -0.1,
+                    done: 0.0,
+                };
+                (evidence, good)
+            })
+            .collect();
+        let found = Calibration::fit(&steps).unwrap();
+        assert!(found.weights.iter().all(|weight| weight.is_finite()));
+        let [good, bad] = [0, 1].map(|index: usize| found.probability(&steps[index].0));
+        assert!(good > 0.95 && bad < 0.05, "{good} {bad}");
+    }
+}

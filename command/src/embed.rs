@@ -31,6 +31,7 @@ pub struct Embed {
 impl Embed {
     pub fn run(self, root: &Root) -> Result<()> {
         let recipe = EmbeddingRecipe::load(&self.recipe)?;
+        root.check_trainable(&recipe.problems)?;
         let mut data = DataSet::default();
         for problem in &recipe.problems {
             root.problem(problem)?;

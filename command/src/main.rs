@@ -16,6 +16,7 @@ mod interfaces;
 mod latency;
 mod launch;
 mod picture;
+mod problems;
 mod progress;
 mod reliability;
 mod root;
@@ -47,6 +48,8 @@ enum Command {
     Bench(bench::Bench),
     /// Make demonstrations of a problem, and keep the successful ones as bags
     Demos(demos::Demos),
+    /// Draw problems of the module arranging at random, and write their files
+    Problems(problems::Problems),
     /// Check the physics of a problem, and that no policy solves it by accident
     Health(health::Health),
     /// Print every topic, service, action and parameter of the nodes: docs/interfaces.md
@@ -85,6 +88,7 @@ fn main() -> Result<ExitCode> {
         Command::Reliability(reliability) => reliability.run(),
         Command::Bench(bench) => bench.run(&root()?),
         Command::Demos(demos) => demos.run(&root()?),
+        Command::Problems(problems) => problems.run(&root()?),
         Command::Health(health) => health.run(&root()?),
         Command::Interfaces(interfaces) => interfaces.run(&root()?),
         Command::Train(train) => train.run(&root()?),

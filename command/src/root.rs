@@ -41,9 +41,40 @@ impl Root {
         self.0.join(path)
     }
 
-    /// A problem by its name.
+    /// A problem by its name, or by the path of its file.
     pub fn problem(&self, name: &str) -> Result<Problem> {
+        if name.ends_with(".yaml") {
+            return Ok(Problem::load_file(Path::new(name))?);
+        }
         Ok(Problem::load(&self.join("config/problems"), name)?)
+    }
+
+    /// The folder of a problem's file and the problem's name, as the simulated cell takes them.
+    pub fn problem_place(&self, name: &str) -> (PathBuf, String) {
+        let path = Path::new(name);
+        match (name.strip_suffix(".yaml"), path.file_stem(), path.parent()) {
+            (Some(_), Some(stem), Some(folder)) => {
+                let here = folder.as_os_str().is_empty();
+                let folder = if here { Path::new(".") } else { folder };
+                (folder.to_owned(), stem.to_string_lossy().into_owned())
+            }
+            _ => (self.join("config/problems"), name.to_owned()),
+        }
+    }
+
+    /// Refuses problems that are kept out of training.
+    pub fn check_trainable(&self, problems: &[String]) -> Result<()> {
+        for name in problems {
+            let file = self.join("config/problems").join(format!("{name}.yaml"));
+            // The files of problems drawn at random are elsewhere.
+            if file.exists() && self.problem(name)?.is_held_out() {
+                bail!(
+                    "{}: held out of all training, expected another problem to train on",
+                    file.display()
+                );
+            }
+        }
+        Ok(())
     }
 
     /// The policy that comes with the repository.

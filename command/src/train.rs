@@ -139,6 +139,7 @@ pub fn train(
     out: &Path,
     resume: bool,
 ) -> Result<Vec<Snapshot>> {
+    root.check_trainable(&recipe.problems)?;
     let data = load(demos, &mut recipe)?;
     tracing::info!(
         "{} demonstrations of {} scenes, {} steps, {:.0} MB of images",

@@ -12,6 +12,8 @@ use tokio::task::JoinHandle;
 /// The nodes and what each is told beside its file in config/.
 pub struct Settings {
     pub problem: String,
+    /// Folder of the problem's file.
+    pub problems_dir: PathBuf,
     pub seed: u64,
     pub demonstration: PathBuf,
     pub checkpoint: PathBuf,
@@ -67,7 +69,7 @@ impl Settings {
             "sim_workcell" => vec![
                 ("problem", self.problem.clone()),
                 ("seed", self.seed.to_string()),
-                ("problems_dir", path(&root.join("config/problems"))),
+                ("problems_dir", path(&self.problems_dir)),
                 ("urdf", path(&root.join("urdf/workcell.urdf"))),
             ],
             "goal_oracle" => vec![

@@ -116,7 +116,7 @@ impl Launch {
         let shown = folder.join("demonstration");
         if shown.exists() {
             let found = Demonstration::read(&shown)?;
-            let expected = format!("{}, seed {shown_seed}", self.problem);
+            let expected = format!("{}, seed {shown_seed}", problem.name());
             let seed = EpisodeSeed {
                 scene: found.seed,
                 start: found.start_seed,
@@ -131,8 +131,10 @@ impl Launch {
         } else {
             demonstration(&problem, &work_cell, shown_seed)?.write(&shown)?;
         }
+        let (problems_dir, name) = root.problem_place(&self.problem);
         let settings = Settings {
-            problem: self.problem.clone(),
+            problem: name,
+            problems_dir: std::path::absolute(problems_dir)?,
             seed: self.seed,
             demonstration: std::path::absolute(shown)?,
             checkpoint: self

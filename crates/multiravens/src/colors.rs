@@ -16,6 +16,12 @@ pub const GREEN: [u8; 3] = [89, 161, 79];
 pub const ORANGE: [u8; 3] = [242, 142, 43];
 /// Purple.
 pub const PURPLE: [u8; 3] = [176, 122, 161];
+/// Cyan.
+pub const CYAN: [u8; 3] = [118, 183, 178];
+/// Pink.
+pub const PINK: [u8; 3] = [255, 157, 167];
+/// White.
+pub const WHITE: [u8; 3] = [240, 240, 236];
 /// Grey: beads.
 pub const GREY: [u8; 3] = [186, 176, 172];
 /// Pegs.

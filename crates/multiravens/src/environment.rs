@@ -4,7 +4,7 @@ use crate::cell::{Cell, CellError, Rehearsal, Watched};
 use crate::problem::Problem;
 use crate::render::RenderError;
 use crate::seed::{Draws, EpisodeSeed, stream};
-use crate::tasks::{Move, Task};
+use crate::tasks::{Move, ParameterError, Task};
 use heightmap::{Fusion, FusionError, Heightmap, View, Workspace};
 use nalgebra::Isometry2;
 use pick_place::{ExecuteError, Outcome, PickPlace, PrimitiveSettings};
@@ -100,6 +100,18 @@ pub enum EnvironmentError {
     /// A step after the end of the episode.
     #[error("the episode is over: reset first")]
     Over,
+    /// What a seed draws does not fit on the table.
+    #[error("problem {problem}, seed {seed}, module {module}: {source}")]
+    Build {
+        /// Name of the problem.
+        problem: String,
+        /// The seed.
+        seed: EpisodeSeed,
+        /// Name of the module.
+        module: &'static str,
+        /// What does not fit.
+        source: ParameterError,
+    },
     /// The bodies of a new episode did not come to rest.
     #[error("problem {problem}, seed {seed}: the scene does not come to rest")]
     Restless {
@@ -160,7 +172,13 @@ impl Environment {
         for (index, placement) in self.problem.modules().iter().enumerate() {
             let mut draws = Draws::new(seed, index as u64);
             let world = self.cell.world_mut();
-            let task = placement.module.build(world, &placement.anchor, &mut draws);
+            let built = placement.module.build(world, &placement.anchor, &mut draws);
+            let task = built.map_err(|source| EnvironmentError::Build {
+                problem: self.problem.name().to_owned(),
+                seed,
+                module: placement.name,
+                source,
+            })?;
             self.tasks.push(Progress {
                 name: placement.name,
                 task,

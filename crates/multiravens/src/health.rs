@@ -56,17 +56,20 @@ impl Extremes {
 
 /// Height of a body's lowest point.
 fn lowest_m(world: &World, body: BodyId) -> f64 {
-    let pose = world.pose(body);
-    // The world's downwards direction, seen from the body.
-    let down = pose.rotation.inverse() * -Vector3::z();
-    let reach = match world.shape(body) {
-        Shape::Sphere { radius_m } => radius_m,
-        Shape::Cuboid { size_m } => 0.5 * size_m.dot(&down.abs()),
-        Shape::Cylinder { radius_m, length_m } => {
-            0.5 * length_m * down.z.abs() + radius_m * down.xy().norm()
-        }
-    };
-    pose.translation.z - reach
+    let lowest = world.components(body).iter().map(|component| {
+        let pose = world.pose(body) * component.pose;
+        // The world's downwards direction, seen from the shape.
+        let down = pose.rotation.inverse() * -Vector3::z();
+        let reach = match component.shape {
+            Shape::Sphere { radius_m } => radius_m,
+            Shape::Cuboid { size_m } => 0.5 * size_m.dot(&down.abs()),
+            Shape::Cylinder { radius_m, length_m } => {
+                0.5 * length_m * down.z.abs() + radius_m * down.xy().norm()
+            }
+        };
+        pose.translation.z - reach
+    });
+    lowest.fold(f64::INFINITY, f64::min)
 }
 
 /// How deep a ball is in an upright cylinder; nothing in anything else.

@@ -1,10 +1,12 @@
 //! Problems: task modules composed on one table, read from YAML.
 
-use crate::tasks::{REGISTRY, TaskModule};
+use crate::tasks::{ParameterError, REGISTRY, TaskModule};
 use heightmap::Workspace;
 use nalgebra::{Isometry2, Point2, Vector2};
-use serde::Deserialize;
+use serde::de::{self, DeserializeSeed, IgnoredAny, MapAccess, SeqAccess, Visitor};
+use serde::{Deserialize, Deserializer};
 use serde_yaml_ng::Value;
+use std::fmt;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
@@ -12,6 +14,7 @@ use std::sync::Arc;
 #[derive(Clone, Debug)]
 pub struct Problem {
     name: String,
+    held_out: bool,
     modules: Vec<Placement>,
 }
 
@@ -39,6 +42,8 @@ pub struct ProblemError {
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 struct File {
+    #[serde(default)]
+    held_out: bool,
     modules: Vec<Entry>,
 }
 
@@ -68,16 +73,27 @@ impl Problem {
             file: file.clone(),
             reason,
         };
-        let plain = |c: char| c.is_ascii_alphanumeric() || "_-+".contains(c);
-        if name.is_empty() || !name.chars().all(plain) {
-            let reason = format!("`{name}` is no problem name: letters, digits, `_`, `-`, `+`");
-            return Err(fail(reason));
-        }
+        check_name(name).map_err(fail)?;
         let text = std::fs::read_to_string(&file).map_err(|error| {
             let known = Self::names(directory).unwrap_or_default();
             let known = known.join(", ");
             fail(format!("no problem `{name}` ({error}); there are: {known}"))
         })?;
+        Self::parse(name, &text).map_err(fail)
+    }
+
+    /// Reads a problem file anywhere; its name without `.yaml` is that of the problem.
+    pub fn load_file(file: &Path) -> Result<Self, ProblemError> {
+        let fail = |reason: String| ProblemError {
+            file: file.to_owned(),
+            reason,
+        };
+        let name = file
+            .file_name()
+            .and_then(|name| name.to_str()?.strip_suffix(".yaml"));
+        let name = name.ok_or_else(|| fail("expected a file NAME.yaml".into()))?;
+        check_name(name).map_err(fail)?;
+        let text = std::fs::read_to_string(file).map_err(|error| fail(error.to_string()))?;
         Self::parse(name, &text).map_err(fail)
     }
 
@@ -104,7 +120,12 @@ impl Problem {
         }
         let mut modules: Vec<Placement> = Vec::new();
         for (index, entry) in file.modules.into_iter().enumerate() {
-            let placement = entry.place().map_err(|e| format!("modules[{index}].{e}"))?;
+            let placement = entry.place().map_err(|e| {
+                let at = format!("modules[{index}].{}", e.field);
+                let line =
+                    line_of(text, &at).map_or(String::new(), |line| format!("line {line}: "));
+                format!("{line}{at}: {}", e.reason)
+            })?;
             let area = placement.area();
             let workspace = Workspace::RAVENS;
             if area.iter().any(|p| workspace.pixel(p).is_none()) {
@@ -130,8 +151,14 @@ impl Problem {
         }
         Ok(Self {
             name: name.to_owned(),
+            held_out: file.held_out,
             modules,
         })
+    }
+
+    /// Whether no policy may be trained on it: it measures what policies do with what they never saw.
+    pub fn is_held_out(&self) -> bool {
+        self.held_out
     }
 
     /// The problem's name.
@@ -146,25 +173,141 @@ impl Problem {
 }
 
 impl Entry {
-    fn place(self) -> Result<Placement, String> {
+    fn place(self) -> Result<Placement, ParameterError> {
+        let fail = |field: &str, reason| ParameterError {
+            field: field.into(),
+            reason,
+        };
         let known = REGISTRY.iter().find(|(name, _)| *name == self.name);
         let (name, configure) = known.ok_or_else(|| {
             let names: Vec<_> = REGISTRY.iter().map(|(name, _)| *name).collect();
             let names = names.join(", ");
-            format!("name: no module `{}`; there are: {names}", self.name)
+            fail(
+                "name",
+                format!("no module `{}`; there are: {names}", self.name),
+            )
         })?;
         let Anchor { x_m, y_m, yaw_rad } = self.anchor;
         for (field, value) in [("x_m", x_m), ("y_m", y_m), ("yaw_rad", yaw_rad)] {
             if !value.is_finite() {
-                return Err(format!("anchor.{field}: is {value}, expected a number"));
+                let reason = format!("is {value}, expected a number");
+                return Err(fail(&format!("anchor.{field}"), reason));
             }
         }
-        let module = configure(self.parameters).map_err(|e| format!("parameters: {e}"))?;
+        let anchor = Isometry2::new(Vector2::new(x_m, y_m), yaw_rad);
+        let module = configure(self.parameters).and_then(|module| {
+            module.check(&anchor)?;
+            Ok(module)
+        });
+        let module = module.map_err(|e| {
+            let dot = if e.field.is_empty() { "" } else { "." };
+            fail(&format!("parameters{dot}{}", e.field), e.reason)
+        })?;
         Ok(Placement {
             name,
-            anchor: Isometry2::new(Vector2::new(x_m, y_m), yaw_rad),
+            anchor,
             module: module.into(),
         })
+    }
+}
+
+/// A problem's name is part of the paths of its demonstrations.
+fn check_name(name: &str) -> Result<(), String> {
+    let plain = |c: char| c.is_ascii_alphanumeric() || "_-+".contains(c);
+    if name.is_empty() || !name.chars().all(plain) {
+        return Err(format!(
+            "`{name}` is no problem name: letters, digits, `_`, `-`, `+`"
+        ));
+    }
+    Ok(())
+}
+
+/// The line, from 1, on which a field such as `modules[0].parameters.pegs` begins; that of the nearest
+/// field around it where it is missing.
+fn line_of(text: &str, field: &str) -> Option<usize> {
+    let steps: Vec<&str> = field
+        .split(['.', '['])
+        .map(|step| step.trim_end_matches(']'))
+        .collect();
+    (1..=steps.len()).rev().find_map(|count| {
+        let found = Seek(&steps[..count]).deserialize(serde_yaml_ng::Deserializer::from_str(text));
+        found
+            .err()
+            .filter(|e| e.to_string().contains(FOUND))?
+            .location()
+            .map(|at| at.line())
+    })
+}
+
+/// What [`Seek`] reports a field by: the parser adds to an error where it was.
+const FOUND: &str = "the field sought";
+
+/// Goes down a document to a field, and fails there.
+struct Seek<'a>(&'a [&'a str]);
+
+impl<'de> DeserializeSeed<'de> for Seek<'_> {
+    type Value = ();
+
+    fn deserialize<D: Deserializer<'de>>(self, deserializer: D) -> Result<(), D::Error> {
+        deserializer.deserialize_any(self)
+    }
+}
+
+impl<'de> Visitor<'de> for Seek<'_> {
+    type Value = ();
+
+    fn expecting(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        f.write_str("a field")
+    }
+
+    fn visit_bool<E: de::Error>(self, _: bool) -> Result<(), E> {
+        Err(E::custom(FOUND))
+    }
+
+    fn visit_i64<E: de::Error>(self, _: i64) -> Result<(), E> {
+        Err(E::custom(FOUND))
+    }
+
+    fn visit_u64<E: de::Error>(self, _: u64) -> Result<(), E> {
+        Err(E::custom(FOUND))
+    }
+
+    fn visit_f64<E: de::Error>(self, _: f64) -> Result<(), E> {
+        Err(E::custom(FOUND))
+    }
+
+    fn visit_str<E: de::Error>(self, _: &str) -> Result<(), E> {
+        Err(E::custom(FOUND))
+    }
+
+    fn visit_unit<E: de::Error>(self) -> Result<(), E> {
+        Err(E::custom(FOUND))
+    }
+
+    fn visit_map<A: MapAccess<'de>>(self, mut map: A) -> Result<(), A::Error> {
+        let Some((first, rest)) = self.0.split_first() else {
+            return Err(de::Error::custom(FOUND));
+        };
+        while let Some(key) = map.next_key::<String>()? {
+            if key == *first {
+                return map.next_value_seed(Seek(rest));
+            }
+            map.next_value::<IgnoredAny>()?;
+        }
+        Ok(())
+    }
+
+    fn visit_seq<A: SeqAccess<'de>>(self, mut seq: A) -> Result<(), A::Error> {
+        let Some((first, rest)) = self.0.split_first() else {
+            return Err(de::Error::custom(FOUND));
+        };
+        let index: usize = first.parse().unwrap_or(usize::MAX);
+        for _ in 0..index {
+            if seq.next_element::<IgnoredAny>()?.is_none() {
+                return Ok(());
+            }
+        }
+        seq.next_element_seed(Seek(rest)).map(|_| ())
     }
 }
 
@@ -242,7 +385,7 @@ mod tests {
         );
         let e =
             error("modules: [{name: routing, anchor: {x_m: 0.5, y_m: 0}, parameters: {pegs: 3}}]");
-        assert!(e.contains("parameters: pegs: "), "{e}");
+        assert!(e.contains("parameters.pegs: "), "{e}");
         let e = error(
             "modules: [{name: placing, anchor: {x_m: 0.5, y_m: 0}, parameters: {tolerance_m: 0.5}}]",
         );

@@ -54,8 +54,11 @@ impl Stage {
             self.scene.add(mesh, pose, body.rgb);
         }
         for body in world.bodies() {
-            let mesh = self.mesh(world.shape(body));
-            self.scene.add(mesh, world.pose(body), world.rgb(body));
+            for component in world.components(body) {
+                let mesh = self.mesh(component.shape);
+                let pose = world.pose(body) * component.pose;
+                self.scene.add(mesh, pose, world.rgb(body));
+            }
         }
         for (camera, image) in self.cameras.iter().zip(&mut self.images) {
             self.rasteriser

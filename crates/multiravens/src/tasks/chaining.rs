@@ -168,7 +168,7 @@ struct ChainingTask {
 }
 
 impl TaskModule for Chaining {
-    fn check(&self) -> Result<(), ParameterError> {
+    fn check(&self, _anchor: &Isometry2<f64>) -> Result<(), ParameterError> {
         // Within these a chain has 31 to 37 beads and all keeps to the footprint.
         for distance in self.distances_m {
             check_range("distances_m", distance, 0.11, 0.14)?;
@@ -189,8 +189,8 @@ impl TaskModule for Chaining {
         world: &mut World,
         anchor: &Isometry2<f64>,
         draws: &mut Draws,
-    ) -> Box<dyn Task> {
-        Box::new(self.draw(world, anchor, draws))
+    ) -> Result<Box<dyn Task>, ParameterError> {
+        Ok(Box::new(self.draw(world, anchor, draws)))
     }
 }
 
@@ -698,7 +698,9 @@ mod tests {
             ("{beads: 12}", "beads"),
         ] {
             let value = serde_yaml_ng::from_str(text).unwrap();
-            let error = crate::tasks::configure::<Chaining>(value).unwrap_err();
+            let module = crate::tasks::configure::<Chaining>(value);
+            let checked = module.and_then(|module| module.check(&Isometry2::identity()));
+            let error = checked.unwrap_err();
             assert!(error.to_string().contains(name), "{error}");
         }
     }

@@ -1,4 +1,4 @@
-//! Task modules: one file each, and one line each in `task_modules!`.
+//! Task modules: one file or folder each, and one line each in [`REGISTRY`].
 
 use crate::cell::{Cell, Rehearsal};
 use crate::seed::Draws;
@@ -11,25 +11,22 @@ use serde::de::DeserializeOwned;
 use serde_yaml_ng::Value;
 use std::fmt;
 
-/// Declares the files and lists, under their names, the modules in them.
-macro_rules! task_modules {
-    ($($name:ident::$module:ident,)*) => {
-        $(mod $name;)*
+pub mod arranging;
+mod chaining;
+mod placing;
+mod routing;
+mod stacking;
 
-        /// All task modules: the name in problem files, and what reads their parameters.
-        pub const REGISTRY: &[(&str, Configure)] =
-            &[$((stringify!($name), configure::<$name::$module>),)*];
-    };
-}
+/// All task modules: the name in problem files, and what reads and checks their parameters.
+pub const REGISTRY: &[(&str, Configure)] = &[
+    ("arranging", arranging::configure),
+    ("chaining", configure::<chaining::Chaining>),
+    ("placing", configure::<placing::Placing>),
+    ("routing", configure::<routing::Routing>),
+    ("stacking", configure::<stacking::Stacking>),
+];
 
-task_modules! {
-    chaining::Chaining,
-    placing::Placing,
-    routing::Routing,
-    stacking::Stacking,
-}
-
-/// Reads and checks the `parameters` of a module in a problem file.
+/// Reads the `parameters` of a module in a problem file.
 pub type Configure = fn(Value) -> Result<Box<dyn TaskModule>, ParameterError>;
 
 /// A module without parameters has its defaults.
@@ -37,25 +34,43 @@ fn configure<M>(parameters: Value) -> Result<Box<dyn TaskModule>, ParameterError
 where
     M: TaskModule + Default + DeserializeOwned + 'static,
 {
-    let module = match parameters {
+    Ok(Box::new(match parameters {
         Value::Null => M::default(),
-        given => {
-            serde_path_to_error::deserialize(given).map_err(|e| ParameterError(e.to_string()))?
-        }
-    };
-    module.check()?;
-    Ok(Box::new(module))
+        given => read(given)?,
+    }))
 }
 
-/// Parameters that a module does not take.
+/// Reads parameters; an error names the field.
+fn read<M: DeserializeOwned>(parameters: Value) -> Result<M, ParameterError> {
+    serde_path_to_error::deserialize(parameters).map_err(|error| {
+        let at = error.path().to_string();
+        // The path of the whole is a dot.
+        let at = if at == "." { String::new() } else { at };
+        field(at, error.into_inner().to_string())
+    })
+}
+
+/// A parameter that a module does not take.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
-#[error("{0}")]
-pub struct ParameterError(pub String);
+#[error("{}{reason}", if field.is_empty() { String::new() } else { format!("{field}: ") })]
+pub struct ParameterError {
+    /// Where it is, such as `goals[2].at.x_m`; empty for all parameters together.
+    pub field: String,
+    /// What is wrong with it, and what was expected.
+    pub reason: String,
+}
+
+fn field(field: impl Into<String>, reason: String) -> ParameterError {
+    ParameterError {
+        field: field.into(),
+        reason,
+    }
+}
 
 /// A task module with its parameters: what an episode's task is drawn from.
 pub trait TaskModule: Send + Sync + fmt::Debug {
-    /// Refuses parameters out of range.
-    fn check(&self) -> Result<(), ParameterError>;
+    /// Refuses parameters out of range, or that cannot be met about this anchor.
+    fn check(&self, anchor: &Isometry2<f64>) -> Result<(), ParameterError>;
 
     /// Edge lengths, along the anchor's x and y, of the rectangle about the anchor that holds all
     /// the module's bodies at the start and in the goal.
@@ -64,8 +79,15 @@ pub trait TaskModule: Send + Sync + fmt::Debug {
     /// Draws a task and adds its bodies to the world, about the anchor. Only where the loose bodies
     /// lie may depend on the start: the same scene has the same bodies, in the same order, and the
     /// same goals.
-    fn build(&self, world: &mut World, anchor: &Isometry2<f64>, draws: &mut Draws)
-    -> Box<dyn Task>;
+    ///
+    /// # Errors
+    /// When what the seed draws does not fit on the table.
+    fn build(
+        &self,
+        world: &mut World,
+        anchor: &Isometry2<f64>,
+        draws: &mut Draws,
+    ) -> Result<Box<dyn Task>, ParameterError>;
 }
 
 /// A task of one episode.
@@ -197,9 +219,7 @@ fn check_range(name: &str, value: f64, low: f64, high: f64) -> Result<(), Parame
     if (low..=high).contains(&value) {
         Ok(())
     } else {
-        Err(ParameterError(format!(
-            "{name} is {value}, expected {low} to {high}"
-        )))
+        Err(field(name, format!("is {value}, expected {low} to {high}")))
     }
 }
 

@@ -106,7 +106,7 @@ struct PlacingTask {
 }
 
 impl TaskModule for Placing {
-    fn check(&self) -> Result<(), ParameterError> {
+    fn check(&self, _anchor: &Isometry2<f64>) -> Result<(), ParameterError> {
         // Beyond half the pitch a disk would be near two cells.
         check_range("tolerance_m", self.tolerance_m, 1e-3, 0.03)?;
         check_range("pick_spread", self.pick_spread, 0.0, 0.8)
@@ -121,8 +121,8 @@ impl TaskModule for Placing {
         world: &mut World,
         anchor: &Isometry2<f64>,
         draws: &mut Draws,
-    ) -> Box<dyn Task> {
-        Box::new(self.draw(world, anchor, draws))
+    ) -> Result<Box<dyn Task>, ParameterError> {
+        Ok(Box::new(self.draw(world, anchor, draws)))
     }
 }
 

@@ -8,7 +8,7 @@
 //!
 //! Module frame: the cable runs along +x; the far side is +y, the side on which it starts -y.
 
-use super::{Move, ParameterError, Task, TaskModule, at_height, check_range, rehearsed};
+use super::{Move, ParameterError, Task, TaskModule, at_height, check_range, field, rehearsed};
 use crate::cell::Cell;
 use crate::colors;
 use crate::seed::Draws;
@@ -127,13 +127,12 @@ struct RoutingTask {
 }
 
 impl TaskModule for Routing {
-    fn check(&self) -> Result<(), ParameterError> {
+    fn check(&self, _anchor: &Isometry2<f64>) -> Result<(), ParameterError> {
         check_range("tolerance_m", self.tolerance_m, 5e-3, 0.03)?;
         let (least, most) = self.pegs;
         if !(2..=3).contains(&least) || !(least..=3).contains(&most) {
-            return Err(ParameterError(format!(
-                "pegs is [{least}, {most}], expected two numbers in order, of 2 and 3"
-            )));
+            let reason = format!("is [{least}, {most}], expected two numbers in order, of 2 and 3");
+            return Err(field("pegs", reason));
         }
         Ok(())
     }
@@ -147,8 +146,8 @@ impl TaskModule for Routing {
         world: &mut World,
         anchor: &Isometry2<f64>,
         draws: &mut Draws,
-    ) -> Box<dyn Task> {
-        Box::new(self.draw(world, anchor, draws))
+    ) -> Result<Box<dyn Task>, ParameterError> {
+        Ok(Box::new(self.draw(world, anchor, draws)))
     }
 }
 

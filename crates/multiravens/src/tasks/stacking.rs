@@ -106,7 +106,7 @@ struct StackingTask {
 }
 
 impl TaskModule for Stacking {
-    fn check(&self) -> Result<(), ParameterError> {
+    fn check(&self, _anchor: &Isometry2<f64>) -> Result<(), ParameterError> {
         check_range("tolerance_m", self.tolerance_m, 1e-3, PITCH_M / 4.0)?;
         check_range("yaw_tolerance_rad", self.yaw_tolerance_rad, 0.01, FRAC_PI_4)?;
         check_range("shift_m", self.shift_m, 0.0, MAX_SHIFT_M)?;
@@ -123,8 +123,8 @@ impl TaskModule for Stacking {
         world: &mut World,
         anchor: &Isometry2<f64>,
         draws: &mut Draws,
-    ) -> Box<dyn Task> {
-        Box::new(self.draw(world, anchor, draws))
+    ) -> Result<Box<dyn Task>, ParameterError> {
+        Ok(Box::new(self.draw(world, anchor, draws)))
     }
 }
 

@@ -73,7 +73,8 @@ impl World {
                         .linear_damping(LINEAR_DAMPING)
                         .angular_damping(ANGULAR_DAMPING)
                 };
-                self.insert(&part, builder, BEAD_SUCTION_FORCE_N as f32)
+                let components = [part.shape.into()];
+                self.insert(&part, &components, builder, BEAD_SUCTION_FORCE_N as f32)
             })
             .collect();
         let links = if closed {

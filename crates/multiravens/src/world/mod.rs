@@ -20,6 +20,7 @@ use rapier3d::prelude::{
     Rotation, SharedShape, SpringCoefficients, Vector,
 };
 use std::f32::consts::FRAC_PI_2;
+use std::sync::Arc;
 use std::time::Duration;
 use suction::Suction;
 
@@ -65,16 +66,34 @@ pub struct Part {
     pub rgb: [u8; 3],
 }
 
+/// A shape at its pose in the frame of its body.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Component {
+    /// Geometry.
+    pub shape: Shape,
+    /// Pose of the shape's centre in the body's frame.
+    pub pose: Isometry3<f64>,
+}
+
+impl From<Shape> for Component {
+    fn from(shape: Shape) -> Self {
+        Self {
+            shape,
+            pose: Isometry3::identity(),
+        }
+    }
+}
+
 /// A body of a [`World`], in the order in which bodies were added.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
 pub struct BodyId(usize);
 
 /// A body as added.
-#[derive(Clone, Copy, Debug)]
+#[derive(Clone, Debug)]
 struct Body {
     handle: RigidBodyHandle,
     collider: ColliderHandle,
-    shape: Shape,
+    components: Arc<[Component]>,
     rgb: [u8; 3],
     suction_force_n: f32,
     fixed: bool,
@@ -154,19 +173,41 @@ impl World {
 
     /// Adds a body.
     pub fn add(&mut self, part: &Part) -> BodyId {
+        self.add_compound(part, &[part.shape.into()])
+    }
+
+    /// Adds a rigid body like `part`, but made of several cuboids instead of its shape.
+    pub fn add_compound(&mut self, part: &Part, components: &[Component]) -> BodyId {
         let (builder, suction_force_n) = match part.mobility {
             Mobility::Fixed => (RigidBodyBuilder::fixed(), 0.0),
             Mobility::Free {
                 suction_force_n, ..
             } => (RigidBodyBuilder::dynamic(), suction_force_n as f32),
         };
-        self.insert(part, builder, suction_force_n)
+        self.insert(part, components, builder, suction_force_n)
     }
 
-    fn insert(&mut self, part: &Part, builder: RigidBodyBuilder, suction_force_n: f32) -> BodyId {
+    fn insert(
+        &mut self,
+        part: &Part,
+        components: &[Component],
+        builder: RigidBodyBuilder,
+        suction_force_n: f32,
+    ) -> BodyId {
+        let free = part.mobility != Mobility::Fixed;
+        let collider = match *components {
+            [Component { shape, pose }] if pose == Isometry3::identity() => collider(&shape, free),
+            _ => {
+                let shapes = components.iter().map(|component| {
+                    let shape = collider(&component.shape, free).shape;
+                    (to_pose(&component.pose), shape)
+                });
+                ColliderBuilder::compound(shapes.collect())
+            }
+        };
         let collider = match part.mobility {
-            Mobility::Fixed => collider(&part.shape, false),
-            Mobility::Free { mass_kg, .. } => collider(&part.shape, true).mass(mass_kg as f32),
+            Mobility::Fixed => collider,
+            Mobility::Free { mass_kg, .. } => collider.mass(mass_kg as f32),
         };
         let (handle, collider) = self.physics.insert(
             builder.pose(to_pose(&part.pose)),
@@ -175,10 +216,10 @@ impl World {
         self.bodies.push(Body {
             handle,
             collider,
-            shape: part.shape,
+            components: components.into(),
             rgb: part.rgb,
             suction_force_n,
-            fixed: part.mobility == Mobility::Fixed,
+            fixed: !free,
         });
         BodyId(self.bodies.len() - 1)
     }
@@ -198,9 +239,14 @@ impl World {
         from_point(self.physics.bodies[self.bodies[body.0].handle].translation())
     }
 
-    /// Geometry of a body.
+    /// Geometry of a body; of one made of several shapes, that of the first.
     pub fn shape(&self, body: BodyId) -> Shape {
-        self.bodies[body.0].shape
+        self.bodies[body.0].components[0].shape
+    }
+
+    /// The shapes that a body is made of.
+    pub fn components(&self, body: BodyId) -> &[Component] {
+        &self.bodies[body.0].components
     }
 
     /// Whether a body is bolted to the table.

@@ -88,19 +88,17 @@ fn a_step_shown_from_another_start_is_learned_in_seconds() {
         trainer.train_step(&samples).unwrap();
     }
     let policy = trainer.policy().unwrap();
-    let (mut picked, mut placed, mut judged) = (0, 0, 0);
+    let (mut picked, mut placed) = (0, 0);
     for scene in (10_000..10_020).map(|seed| Toy::new(seed, ROTATIONS)) {
         let goal = scene.shown_elsewhere().goal;
         let decision = policy.decide(&scene.observation, goal, &[]).unwrap();
         let error = scene.error(&decision);
         picked += usize::from(error.is_some());
         placed += usize::from(error.is_some_and(|(distance_m, _)| distance_m < 0.006));
-        let after = policy.decide(&scene.goal, goal, &[]).unwrap();
-        judged += usize::from(decision.done < Some(0.5) && after.done > Some(0.5));
     }
     assert!(
-        picked >= 17 && placed >= 15 && judged >= 15,
-        "of 20 scenes {picked} picked, {placed} placed, {judged} judged"
+        picked >= 17 && placed >= 15,
+        "of 20 scenes {picked} picked, {placed} placed"
     );
 }
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import http.client
 import importlib.util
 import json
 import os
@@ -10,9 +11,12 @@ import random
 import re
 import signal
 import socket
+import ssl
 import sys
 import time
+import urllib.error
 import urllib.parse
+import urllib.request
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -200,6 +204,35 @@ def test_a_motion_is_stopped_and_the_run_goes_on_and_a_second_browser_takes_over
     bob.close()
 
 
+def test_a_motion_stops_when_the_deciding_page_is_closed_and_the_run_goes_on_when_somebody_is_back(
+    browser: Browser, start, operator: Operator
+) -> None:
+    _, address = launch_web(start, 10010, "--require-presence")
+    ada = Person(browser, address, "Ada")
+    ada.takes_control()
+    ada.reads("proposes")
+    ada.can("Approve")
+    slow_down(operator, 0.5)
+    results = operator.count("step_result")
+    ada.button("Approve").click()
+    ada.reads("the arm moves")
+    ada.close()
+    stopped = operator.next("step_result", results)
+    assert stopped.outcome == StepResult.STOPPED, stopped
+    slow_down(operator, 0.0)
+    bob = Person(browser, address, "Bob")
+    bob.reads("stopped")
+    bob.takes_control(over="Ada")
+    bob.button("Arm home").click()
+    expect(bob.page.get_by_text("The arm is at home.")).to_be_visible()
+    bob.button("Continue").click()
+    bob.reads("proposes")
+    bob.can("Approve")
+    bob.button("Approve").click()
+    bob.reads("did it succeed")
+    bob.close()
+
+
 def test_a_task_is_taught_by_clicks_saved_and_repeated(browser: Browser, start, operator: Operator, tmp_path: pathlib.Path) -> None:
     _, address = launch_web(start, 10008, "--library", tmp_path / "library")
     ada = Person(browser, address, "Ada")
@@ -274,6 +307,43 @@ def test_a_program_approves_a_step_and_is_refused_what_is_stale(start, decided) 
     assert state["steps"][-1]["proposal"]["id"] == second["proposal"]["id"]
     said = [one.decision for one in decided()]
     assert said == [StepConfirmation.REJECT, StepConfirmation.APPROVE]
+
+
+def test_the_page_is_served_with_tls_and_another_address_needs_it(start, tmp_path: pathlib.Path) -> None:
+    address_file = tmp_path / "address"
+    tls = REPOSITORY / "tests/tls"
+    parameters = {"port": 0, "address_file": address_file, "address": "0.0.0.0"}
+    refused = start("operator_console", "--ros-args", *as_arguments(parameters))
+    assert refused.wait(20.0) == 1
+    assert "tls.certificate" in refused.errors()
+
+    parameters |= {"tls.certificate": tls / "certificate.pem", "tls.key": tls / "key.pem", "token": "a-token-of-the-test"}
+    start("operator_console", "--ros-args", *as_arguments(parameters))
+    address = until(lambda: address_file.exists() and address_file.read_text(), "address of the page", 20.0)
+    assert address_file.stat().st_mode & 0o077 == 0
+    assert address.startswith("https://0.0.0.0:")
+    port = int(re.search(r":(\d+)/", address).group(1))
+    trusted = ssl.create_default_context(cafile=tls / "certificate.pem")
+
+    def ask(url: str, token: str) -> int:
+        request = urllib.request.Request(url, headers={"Authorization": f"Bearer {token}"})
+        try:
+            with urllib.request.urlopen(request, timeout=10, context=trusted) as response:
+                return response.status
+        except urllib.error.HTTPError as error:
+            return error.code
+
+    url = f"https://localhost:{port}/api/v1/state"
+    assert ask(url, "a-token-of-the-test") == 200
+    assert ask(url, "another-token") == 401
+    # The answer is no HTTP: a TLS alert.
+    with pytest.raises(http.client.BadStatusLine):
+        urllib.request.urlopen(url.replace("https", "http"), timeout=10)
+
+
+def as_arguments(parameters: dict[str, object]) -> list[str]:
+    """Parameters as `-p name:=value`."""
+    return [word for name, value in parameters.items() for word in ("-p", f"{name}:={value}")]
 
 
 def test_hostile_input_moves_nothing_and_the_page_works_on(start, decided) -> None:

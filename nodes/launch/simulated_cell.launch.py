@@ -58,7 +58,12 @@ def generate_launch_description() -> LaunchDescription:
             node("goal_oracle", demonstration=LaunchConfiguration("demonstration"), start_empty=True),
             node("gctn_policy", checkpoint=LaunchConfiguration("checkpoint")),
             node("suction_executor", urdf=share("urdf", "workcell.urdf")),
-            node("operator_console", port=LaunchConfiguration("console_port"), condition=IfCondition(LaunchConfiguration("console"))),
+            node(
+                "operator_console",
+                condition=IfCondition(LaunchConfiguration("console")),
+                port=LaunchConfiguration("console_port"),
+                demonstration=LaunchConfiguration("demonstration"),
+            ),
             Node(
                 package="rviz2",
                 executable="rviz2",

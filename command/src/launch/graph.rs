@@ -23,6 +23,8 @@ pub struct Settings {
     pub embedding: PathBuf,
     /// Whether nothing moves, and with the oracle nothing advances, without an operator's word.
     pub operated: bool,
+    /// Whether nothing moves while no operator is present.
+    pub require_presence: bool,
     /// The operator's console, where there is one.
     pub console: Option<Console>,
 }
@@ -84,6 +86,7 @@ impl Settings {
                     // Several graphs on one machine do not take each other's port.
                     ("port", "0".to_owned()),
                     ("address_file", path(&console.address_file)),
+                    ("demonstration", path(&self.demonstration)),
                     ("library", path(&console.library)),
                 ],
                 None => Vec::new(),
@@ -91,6 +94,7 @@ impl Settings {
             "suction_executor" => vec![
                 ("urdf", path(&root.join("urdf/workcell.urdf"))),
                 ("require_approval", self.operated.to_string()),
+                ("require_presence", self.require_presence.to_string()),
             ],
             _ => Vec::new(),
         }

@@ -58,6 +58,9 @@ pub struct Launch {
     /// Checkpoint for the goal module of that name [default: the shipped one]
     #[arg(long)]
     embedding: Option<PathBuf>,
+    /// Stop every motion when the page of the person who decides is closed, hidden or has lost its link for a second
+    #[arg(long)]
+    require_presence: bool,
     /// Folder of the tasks that --operator web can have repeated; what is taught is saved there
     #[arg(long, default_value = "out/library")]
     library: PathBuf,
@@ -147,6 +150,7 @@ impl Launch {
                 .clone()
                 .unwrap_or_else(|| root.shipped_embedding()),
             operated: self.operator != OperatorKind::Watch,
+            require_presence: self.require_presence,
             console: match self.operator {
                 OperatorKind::Web => Some(graph::Console {
                     address_file: std::path::absolute(temporary.path().join("console"))?,

@@ -1,7 +1,7 @@
 // The operator's page: what the console says, as pictures and words, and the operator's decisions.
 
 import { Api } from "./api.js";
-import { board, draw, drawProposal, pointed } from "./view.js";
+import { board, draw, drawProposal, middleOfObject, pointed } from "./view.js";
 
 const ROBOT_MODES = {
   "-1": "no controller", 0: "disconnected", 1: "confirm safety", 2: "booting", 3: "power off", 4: "power on", 5: "idle",
@@ -272,7 +272,11 @@ boards.now.svg.addEventListener("pointerdown", (event) => {
   for (const which of ["pick", "place"]) {
     if (correction[which]) continue;
     correction[which] = { x_m, y_m, yaw_rad: 0 };
-    if (which === "pick") return showCorrection();
+    if (which === "pick") {
+      const picture = pictures.get("present");
+      if (picture) [correction.pick.x_m, correction.pick.y_m] = middleOfObject(state.heightmap, picture, x_m, y_m);
+      return showCorrection();
+    }
     break;
   }
   const dragged = distance(correction.pick) < distance(correction.place) ? correction.pick : correction.place;

@@ -8,6 +8,8 @@ const COLOR_DIFFERS = 40;
 /** Where the object under the cursor ends: a step in height [m], and its largest reach [m]. */
 const EDGE_M = 0.008;
 const REACH_M = 0.2;
+/** Cells belong to another object when one of red, green and blue differs by more. */
+const OTHER_OBJECT = 60;
 const RAMP = [[24, 22, 66], [50, 90, 142], [38, 150, 140], [122, 201, 90], [253, 231, 76]];
 
 /** World position to picture, in cells. */
@@ -69,9 +71,9 @@ export function draw(canvas, picture, mode, other) {
   return different / (rows * cols);
 }
 
-/** Cells of the object under a world position: [row, first col, last col], relative to the position, in cells. */
+/** Cells of the object under a world position, by height and colour: [row, first col, last col], relative to the position, in cells. */
 export function objectAt(map, picture, x_m, y_m) {
-  const { rows, cols, height_m } = picture;
+  const { rows, cols, rgb, height_m } = picture;
   const [startRow, startCol] = [Math.floor((y_m - map.origin_y_m) / map.pixel_size_m), Math.floor((x_m - map.origin_x_m) / map.pixel_size_m)];
   const start = startRow * cols + startCol;
   if (!(startRow >= 0 && startRow < rows && startCol >= 0 && startCol < cols) || height_m[start] < EDGE_M / 2) return [];
@@ -86,6 +88,7 @@ export function objectAt(map, picture, x_m, y_m) {
       if (nextRow < 0 || nextRow >= rows || nextCol < 0 || nextCol >= cols || seen.has(next)) continue;
       if (Math.hypot(nextRow - startRow, nextCol - startCol) > reach) continue;
       if (height_m[next] < EDGE_M / 2 || Math.abs(height_m[next] - height_m[cell]) > EDGE_M) continue;
+      if ([0, 1, 2].some((part) => Math.abs(rgb[3 * next + part] - rgb[3 * start + part]) > OTHER_OBJECT)) continue;
       seen.add(next);
       open.push(next);
     }
@@ -101,6 +104,18 @@ export function objectAt(map, picture, x_m, y_m) {
   }
   const [rowAt, colAt] = [(y_m - map.origin_y_m) / map.pixel_size_m, (x_m - map.origin_x_m) / map.pixel_size_m];
   return runs.map(([row, first, last]) => [row - rowAt, first - colAt, last + 1 - colAt]);
+}
+
+/** The middle of the object under a world position; the position itself where there is none. */
+export function middleOfObject(map, picture, x_m, y_m) {
+  let [area, rowSum, colSum] = [0, 0, 0];
+  for (const [row, first, last] of objectAt(map, picture, x_m, y_m)) {
+    area += last - first;
+    rowSum += (last - first) * (row + 0.5);
+    colSum += ((last - first) * (first + last)) / 2;
+  }
+  if (!area) return [x_m, y_m];
+  return [x_m + (colSum / area) * map.pixel_size_m, y_m + (rowSum / area) * map.pixel_size_m];
 }
 
 function element(name, attributes, parent, text) {

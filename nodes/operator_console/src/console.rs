@@ -212,7 +212,19 @@ impl State {
 
     /// Executor or oracle has reported.
     pub fn on_result(&mut self, message: &StepResult, now: Duration) -> Result<(), InvalidMessage> {
+        let by_itself =
+            message.outcome == StepResult::STOPPED && self.run.phase() != Phase::Stopped;
         self.run.on_result(message, now)?;
+        if by_itself && self.lesson.is_none() && self.run.phase() == Phase::Stopped {
+            // The executor has stopped by itself, for instance because the operator was gone: everybody has to know that the run
+            // is stopped, or it cannot be continued. While the console is inactive there is nobody to tell.
+            let _ = self.confirm(StepConfirmation {
+                proposal_id: message.proposal_id,
+                decision: StepConfirmation::STOP,
+                operator_name: "operator_console".to_owned(),
+                ..StepConfirmation::default()
+            });
+        }
         if let (Some(lesson), Ok(ended)) = (
             &mut self.lesson,
             convert::time_from_msg(&message.header.stamp),
@@ -573,6 +585,31 @@ pub(crate) mod tests {
             .unwrap();
         console.change(|state, _| state.on_confirmation(&confirmation));
         decide(&console, ada, 7, Decision::Approve).unwrap();
+    }
+
+    #[test]
+    fn a_motion_that_stops_by_itself_stops_the_run_for_everybody() {
+        let (console, ada, mut commands) = proposed();
+        decide(&console, ada, 7, Decision::Approve).unwrap();
+        commands.try_recv().unwrap();
+        let mut stopped = StepResult {
+            proposal_id: 7,
+            outcome: StepResult::STOPPED,
+            ..StepResult::default()
+        };
+        stopped.duration.sec = 1;
+        console
+            .change(|state, now| state.on_result(&stopped, now))
+            .unwrap();
+        let Ok(Command::Confirm(stop)) = commands.try_recv() else {
+            panic!("expected a stop");
+        };
+        assert_eq!(stop.decision, StepConfirmation::STOP);
+        // One stop is enough, and an operator's own needs no other.
+        console
+            .change(|state, now| state.on_result(&stopped, now))
+            .unwrap();
+        assert!(commands.try_recv().is_err());
     }
 
     #[test]

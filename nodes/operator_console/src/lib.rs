@@ -16,22 +16,25 @@ mod tls;
 use std::fs::OpenOptions;
 use std::io::Write as _;
 use std::os::unix::fs::OpenOptionsExt as _;
-use std::path::Path;
+use std::path::{Path, PathBuf};
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use anyhow::Context as _;
+use bags::Demonstration;
+use msgs::convert;
 use msgs::diagnostic_msgs::DiagnosticArray;
 use msgs::sctn_msgs::{
-    Goal, Heightmap, LoadDemonstration, LoadDemonstrationRequest, PickPlace, Reward, SetStep,
-    SetStepRequest, StepConfirmation, StepResult,
+    Goal, Heightmap, LoadDemonstration, LoadDemonstrationRequest, OperatorPresence, PickPlace,
+    Reward, SetStep, SetStepRequest, StepConfirmation, StepResult,
 };
 use msgs::sensor_msgs::JointState;
-use msgs::std_msgs::Bool;
+use msgs::std_msgs::{Bool, Header};
 use msgs::std_srvs::{Trigger, TriggerRequest};
 use msgs::ur_dashboard_msgs::{RobotMode, SafetyMode};
 use msgs::ur_msgs::{Digital, IOStates};
 use node_kit::{Active, CallOptions, Level, Node, Publisher, Qos, ServiceClient};
+use tokio::time::MissedTickBehavior;
 use tokio_rustls::TlsAcceptor;
 use tokio_util::sync::CancellationToken;
 use tracing::{info, warn};
@@ -45,6 +48,8 @@ use crate::tls::Listener;
 
 pub use parameters::{OperatorConsoleParameters, Tls};
 
+/// Time between messages that say whether the operator is present.
+const PRESENCE_PERIOD: Duration = Duration::from_millis(200);
 /// Joint states are taken over at most this often: a UR5 sends 500 a second.
 const JOINTS_PERIOD: Duration = Duration::from_millis(50);
 const CHOOSE_ANOTHER: &str =
@@ -88,6 +93,7 @@ pub async fn configure(
     Ok(ConsoleNode {
         confirmations: node.publisher("step_confirmation", Qos::Event)?,
         proposals: node.publisher("pick_place", Qos::Latched)?,
+        presence: node.publisher("operator_presence", Qos::Event)?,
         home: Arc::new(node.service_client(&format!("{}/home", parameters.executor))?),
         set_step: Arc::new(node.service_client(&format!("{}/set_step", parameters.goal_oracle))?),
         load: Arc::new(
@@ -112,6 +118,7 @@ pub struct ConsoleNode {
     console: Arc<Console>,
     confirmations: Publisher<StepConfirmation>,
     proposals: Publisher<PickPlace>,
+    presence: Publisher<OperatorPresence>,
     home: Arc<ServiceClient<Trigger>>,
     set_step: Arc<ServiceClient<SetStep>>,
     load: Arc<ServiceClient<LoadDemonstration>>,
@@ -123,6 +130,10 @@ impl Active for ConsoleNode {
         let mut commands = self.console.connect();
         let end = CancellationToken::new();
         let _ended = end.clone().drop_guard();
+        if self.parameters.demonstration != Path::new("") {
+            let path = self.parameters.demonstration.clone();
+            show_demonstration(node, &self.console, path).await;
+        }
         self.serve(node, &end).await?;
         let io_and_status = |name| format!("{}/{name}", self.parameters.io_and_status);
         let mut heightmaps = node.subscription::<Heightmap>("heightmap", Qos::Latched)?;
@@ -143,8 +154,11 @@ impl Active for ConsoleNode {
             node.subscription::<Bool>(&io_and_status("robot_program_running"), Qos::Latched)?;
         let console = Arc::clone(&self.console);
         let mut joints_taken: Option<Instant> = None;
+        let mut presence = tokio::time::interval(PRESENCE_PERIOD);
+        presence.set_missed_tick_behavior(MissedTickBehavior::Delay);
         loop {
             tokio::select! {
+                _ = presence.tick() => self.publish_presence(node),
                 Some(command) = commands.recv() => self.carry_out(node, command),
                 message = heightmaps.recv() => {
                     if let Err(reason) = console.change(|state, now| state.on_heightmap(message, now)) {
@@ -253,6 +267,19 @@ impl ConsoleNode {
         Ok(())
     }
 
+    fn publish_presence(&self, node: &Node) {
+        let mut message = self.console.read(|state, now| {
+            let (name, is_present) = state.sessions.presence(now).unwrap_or(("", false));
+            OperatorPresence {
+                operator_name: name.to_owned(),
+                is_present,
+                ..OperatorPresence::default()
+            }
+        });
+        message.header.stamp = node.now();
+        self.presence.publish(message);
+    }
+
     fn carry_out(&self, node: &Node, command: Command) {
         match command {
             Command::Confirm(mut confirmation) => {
@@ -297,7 +324,9 @@ impl ConsoleNode {
                     request_id: secret(),
                     path: path.display().to_string(),
                 };
+                let shown = node.clone();
                 node.spawn(async move {
+                    show_demonstration(&shown, &console, path).await;
                     let answer = client.call(&request, &CallOptions::default()).await;
                     let (kind, reason, advice) = match answer {
                         Ok(answer) if answer.success => {
@@ -338,6 +367,28 @@ impl ConsoleNode {
                 });
             }
         }
+    }
+}
+
+/// Name and goal images of a demonstration.
+fn read_demonstration(path: &Path) -> anyhow::Result<(String, Vec<Heightmap>)> {
+    let demonstration = Demonstration::read(path)?;
+    let image = |heightmap: &heightmap::Heightmap| {
+        convert::heightmap_to_msg(heightmap.clone(), Header::default(), 0, 0.0)
+    };
+    let images = demonstration.goals().into_iter().map(image);
+    Ok((demonstration.name(), images.collect::<Result<_, _>>()?))
+}
+
+/// Shows the images of a demonstration before they are latched.
+async fn show_demonstration(node: &Node, console: &Console, path: PathBuf) {
+    let reading = path.clone();
+    let read = node.spawn_blocking(move || read_demonstration(&reading));
+    match read.await.context("reading panicked").flatten() {
+        Ok((name, images)) => {
+            console.change(|state, now| state.run.on_demonstration(name, images, now));
+        }
+        Err(error) => warn!("demonstration {}: {error:#}", path.display()),
     }
 }
 

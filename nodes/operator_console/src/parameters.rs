@@ -23,6 +23,7 @@ pub struct OperatorConsoleParameters {
     pub max_viewers: usize,
     pub stale_after_s: f64,
     pub session_timeout_s: f64,
+    pub demonstration: PathBuf,
     pub library: PathBuf,
     pub nodes: Vec<String>,
     pub executor: String,
@@ -55,6 +56,7 @@ impl Default for OperatorConsoleParameters {
             max_viewers: 16,
             stale_after_s: 3.0,
             session_timeout_s: 60.0,
+            demonstration: PathBuf::new(),
             library: "out/library".into(),
             nodes: names(&[
                 "camera_fusion",

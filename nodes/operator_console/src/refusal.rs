@@ -23,7 +23,11 @@ impl Refusal {
 }
 
 /// What a person should do about a reason that executor or oracle gave: part of the reason, advice.
-const ADVICE: [(&str, &str); 20] = [
+const ADVICE: [(&str, &str); 21] = [
+    (
+        "no operator is present",
+        "Keep the page of the operator open and in sight while the arm moves.",
+    ),
     (
         "the observation has changed",
         "Something moved on the table since the proposal. Wait for the new proposal and look at it again.",

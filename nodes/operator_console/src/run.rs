@@ -201,6 +201,8 @@ pub struct Run {
     goal_count: u64,
     /// Goals of the present demonstration that were latched, by step.
     strip: BTreeMap<u32, View>,
+    /// A demonstration that was read: its name, and the goal images of its steps.
+    demonstration: Option<(String, Vec<View>)>,
     offered: VecDeque<Offered>,
     /// Id of the newest proposal.
     newest: Option<u64>,
@@ -233,6 +235,7 @@ impl Run {
             goal_view: None,
             goal_count: 0,
             strip: BTreeMap::new(),
+            demonstration: None,
             offered: VecDeque::new(),
             newest: None,
             stopped: false,
@@ -386,8 +389,11 @@ impl Run {
         let fault = message.outcome == StepResult::FAULT;
         match message.outcome {
             StepResult::REFUSED => {
+                // The result was lost, for instance while the console was not there.
+                let was_carried_out = message.reason.contains("was already carried out");
                 if let Some(offered) = self.offered(message.proposal_id) {
                     offered.status = match offered.status {
+                        Status::Approved if was_carried_out => Status::Moved { fault: false },
                         Status::Approved => Status::Open,
                         Status::Confirmed { fault } => Status::Moved { fault },
                         ref status => status.clone(),
@@ -660,9 +666,26 @@ impl Run {
         self.goal_view.as_ref()
     }
 
+    /// A demonstration was read: its images are shown before they are latched, where it is the present one.
+    pub fn on_demonstration(&mut self, name: String, images: Vec<Heightmap>, now: Duration) {
+        let views = images.into_iter().map(|heightmap| View {
+            // Goals that were latched count from 1.
+            number: 0,
+            heightmap: Arc::new(heightmap),
+            stamp: Duration::ZERO,
+            arrived: now,
+        });
+        self.demonstration = Some((name, views.collect()));
+    }
+
     /// The goal image of a step of the present demonstration, where it is known.
     pub fn strip(&self, step: u32) -> Option<&View> {
-        self.strip.get(&step)
+        self.strip.get(&step).or_else(|| {
+            let goal = self.goal.as_ref()?;
+            let (name, images) = self.demonstration.as_ref()?;
+            let same = *name == goal.demonstration && images.len() == goal.step_count as usize;
+            images.get(step.checked_sub(1)? as usize).filter(|_| same)
+        })
     }
 
     /// The views before and after a past step, by its number.
@@ -780,10 +803,8 @@ impl Run {
                 complete: goal.complete,
                 module: &goal.module,
                 heightmap: self.goal_view.as_ref().map(ViewState::of),
-                strip: self
-                    .strip
-                    .iter()
-                    .map(|(step, view)| (*step, view.number))
+                strip: (1..=goal.step_count)
+                    .filter_map(|step| Some((step, self.strip(step)?.number)))
                     .collect(),
             }),
             proposal: current.map(|offered| ProposalState::of(&offered.message)),

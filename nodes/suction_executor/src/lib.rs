@@ -8,6 +8,7 @@ pub mod gate;
 mod home;
 mod node;
 mod parameters;
+mod presence;
 mod rehearsal;
 pub mod status;
 

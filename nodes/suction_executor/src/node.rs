@@ -30,6 +30,7 @@ use crate::driver::{DriverError, DriverRobot, Link};
 use crate::gate::{Answer, Decision, Gate, Proposal, Proposed, Rules, Verdict};
 use crate::home::go_home;
 use crate::parameters::{Driver, SuctionExecutorParameters};
+use crate::presence::Presence;
 use crate::rehearsal::rehearse;
 use crate::status::{DriverStatus, JointReading, Pins, StillRule};
 
@@ -108,6 +109,10 @@ impl Active for ExecutorNode {
             proposals: node.subscription("pick_place", Qos::Latched)?,
             confirmations: node.subscription("step_confirmation", Qos::Event)?,
             heightmaps: node.subscription("heightmap", Qos::Latched)?,
+            presences: node.subscription("operator_presence", Qos::Event)?,
+            presence: Presence::new(Duration::from_secs_f64(
+                parameters.borrow().presence_timeout_s,
+            )),
             results: &self.results,
             home: node.service_server("~/home")?,
             home_calls: Vec::new(),
@@ -240,6 +245,8 @@ struct Executor<'a> {
     proposals: Subscription<sctn_msgs::PickPlace>,
     confirmations: Subscription<sctn_msgs::StepConfirmation>,
     heightmaps: Subscription<sctn_msgs::Heightmap>,
+    presences: Subscription<sctn_msgs::OperatorPresence>,
+    presence: Presence,
     results: &'a Publisher<sctn_msgs::StepResult>,
     home: ServiceServer<Trigger>,
     /// Calls of `home` to be answered when the arm is there.
@@ -268,10 +275,13 @@ impl Executor<'_> {
         let mut diagnostics = tokio::time::interval(DIAGNOSTICS_PERIOD);
         loop {
             let deadline = self.waiting.front().map(|waiting| waiting.until);
+            let absence = self.absence();
             tokio::select! {
                 message = self.heightmaps.recv() => self.on_heightmap(message),
                 message = self.proposals.recv() => self.on_proposal(message),
                 message = self.confirmations.recv() => self.on_confirmation(message),
+                message = self.presences.recv() => self.on_presence(&message),
+                () = sleep_until(absence) => self.on_absence(),
                 (call, _) = self.home.recv() => self.on_home(call),
                 goal = self.goals.recv() => self.on_goal(goal),
                 () = cancel_of(&self.goal) => self.on_goal_cancel(),
@@ -303,6 +313,36 @@ impl Executor<'_> {
             self.on_end(cause, stopped, ended);
         }
         Ok(())
+    }
+
+    fn on_presence(&mut self, message: &sctn_msgs::OperatorPresence) {
+        self.presence.on_message(message.is_present, Instant::now());
+        if self
+            .absence()
+            .is_some_and(|absence| absence <= Instant::now())
+        {
+            self.on_absence();
+        }
+    }
+
+    /// When a motion is to stop because nobody is present; never where that is not asked for.
+    fn absence(&self) -> Option<Instant> {
+        let motion = self.motion.as_ref()?;
+        let watched = self.parameters.require_presence && !motion.stop.is_cancelled();
+        watched.then(|| self.presence.deadline().unwrap_or_else(Instant::now))
+    }
+
+    fn on_absence(&mut self) {
+        if let Some(motion) = &self.motion {
+            warn!("no operator is present: stopping");
+            motion.stop.cancel();
+        }
+    }
+
+    /// Why nothing may begin to move: nobody is present.
+    fn unattended(&self) -> Option<String> {
+        let absent = self.parameters.require_presence && !self.presence.is_present(Instant::now());
+        absent.then(|| "no operator is present (require_presence)".to_owned())
     }
 
     fn on_heightmap(&mut self, message: sctn_msgs::Heightmap) {
@@ -500,6 +540,17 @@ impl Executor<'_> {
                 self.report(waiting.id, StepResult::REFUSED, reason, None);
             }
         }
+        if decision == Decision::Approve
+            && let Some(reason) = self.unattended()
+        {
+            self.report(
+                id,
+                StepResult::REFUSED,
+                format!("proposal {id}: {reason}"),
+                None,
+            );
+            return;
+        }
         let arm = &self.work_cell.arm;
         let verdict = self.gate.confirm(
             id,
@@ -576,10 +627,13 @@ impl Executor<'_> {
             .as_ref()
             .is_some_and(|motion| motion.cause == Cause::Home);
         if !at_work {
-            if let Err(reason) = self
-                .gate
-                .go_home(&self.status.borrow(), self.origin.elapsed())
-            {
+            let allowed = match self.unattended() {
+                Some(reason) => Err(reason),
+                None => self
+                    .gate
+                    .go_home(&self.status.borrow(), self.origin.elapsed()),
+            };
+            if let Err(reason) = allowed {
                 warn!("home: {reason}");
                 self.home.respond(
                     call,

@@ -12,6 +12,10 @@ use serde::{Deserialize, Serialize};
 pub struct SuctionExecutorParameters {
     /// Whether every motion needs an operator's approval.
     pub require_approval: bool,
+    /// Whether nothing moves while no operator is present.
+    pub require_presence: bool,
+    /// Wall seconds after which an operator who has shown no sign is not present.
+    pub presence_timeout_s: f64,
     /// Frame of proposals.
     pub world_frame: String,
     /// URDF of the work cell; empty for the one that was compiled in.
@@ -82,6 +86,8 @@ impl Default for SuctionExecutorParameters {
     fn default() -> Self {
         Self {
             require_approval: true,
+            require_presence: false,
+            presence_timeout_s: 1.0,
             world_frame: "world".into(),
             urdf: PathBuf::new(),
             limits: Limits::default(),
@@ -157,6 +163,7 @@ impl Parameters for SuctionExecutorParameters {
         ("limits.acceleration_m_s2", Range::POSITIVE),
         ("observation_tolerance_m", Range::POSITIVE),
         ("observation_changed_fraction", Range::SHARE),
+        ("presence_timeout_s", Range::POSITIVE),
         ("confirmation_grace_s", TIME),
         ("driver.suction_pin", PIN),
         ("driver.vacuum_pin", PIN),

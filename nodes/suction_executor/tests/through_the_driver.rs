@@ -8,7 +8,7 @@ use std::time::{Duration, Instant};
 use heightmap::{Camera, Fusion, Heightmap, View, Workspace};
 use msgs::convert;
 use msgs::diagnostic_msgs::DiagnosticArray;
-use msgs::sctn_msgs::{self, Reward, StepConfirmation, StepResult};
+use msgs::sctn_msgs::{self, OperatorPresence, Reward, StepConfirmation, StepResult};
 use msgs::sensor_msgs::{CameraInfo, Image, JointState};
 use msgs::std_srvs::{Trigger, TriggerRequest};
 use msgs::tf2_msgs::TFMessage;
@@ -618,5 +618,56 @@ async fn without_require_approval_a_proposal_moves_once_by_itself_until_a_stop()
     assert_eq!(bench.joints().await.position, before);
     bench.decide(2, StepConfirmation::APPROVE);
     bench.ended(2, StepResult::PLACED).await;
+    bench.stop().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn with_require_presence_nothing_moves_unattended_and_a_motion_stops_when_the_operator_falls_silent()
+ {
+    let required = [("require_presence", "true".to_owned())];
+    let (mut bench, environment, _) = proposed(&slow(), &required).await;
+    bench.decide(1, StepConfirmation::APPROVE);
+    let result = bench.ended(1, StepResult::REFUSED).await;
+    assert!(
+        result.reason.contains("no operator is present"),
+        "{}",
+        result.reason
+    );
+    let presence = bench
+        .node
+        .publisher("operator_presence", Qos::Event)
+        .unwrap();
+    let graph = bench.node.graph();
+    assert!(
+        graph
+            .wait_for_subscription(presence.topic(), PATIENCE)
+            .await
+    );
+    let present = || {
+        presence.publish(OperatorPresence {
+            is_present: true,
+            ..OperatorPresence::default()
+        });
+    };
+    // The operator is there until the arm moves, and then nothing more is heard.
+    for _ in 0..5 {
+        present();
+        tokio::time::sleep(Duration::from_millis(200)).await;
+    }
+    bench.decide(1, StepConfirmation::APPROVE);
+    {
+        let mut moving = std::pin::pin!(bench.until_moving());
+        loop {
+            tokio::select! {
+                () = &mut moving => break,
+                () = tokio::time::sleep(Duration::from_millis(200)) => present(),
+            }
+        }
+    }
+    let result = bench.ended(1, StepResult::STOPPED).await;
+    assert_eq!(result.proposal_id, 1);
+    let stopped = bench.joints().await;
+    let home = environment.cell().work_cell().arm.home;
+    assert!(stopped.position != home.iter().copied().collect::<Vec<_>>());
     bench.stop().await;
 }

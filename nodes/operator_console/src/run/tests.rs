@@ -336,6 +336,14 @@ fn the_demonstration_strip_holds_what_was_latched_and_begins_anew_with_another()
     other.demonstration = "stacking/10002".into();
     run.on_goal(other, NOW).unwrap();
     assert!(run.strip(1).is_some() && run.strip(2).is_none());
+    // One that was read fills the gaps, where it is the present one.
+    let read = || vec![heightmap(0, 0.1), heightmap(0, 0.2)];
+    run.on_demonstration("stacking/10000".into(), read(), NOW);
+    assert!(run.strip(2).is_none());
+    run.on_demonstration("stacking/10002".into(), read(), NOW);
+    assert_eq!(run.strip(1).unwrap().number, 3);
+    assert_eq!(run.strip(2).unwrap().heightmap.height_m[0], 0.2);
+    assert!(run.strip(0).is_none() && run.strip(3).is_none());
 }
 
 #[test]

@@ -6,14 +6,23 @@ use crate::render::RenderError;
 use crate::seed::{Draws, EpisodeSeed, stream};
 use crate::tasks::{Move, ParameterError, Task};
 use heightmap::{Fusion, FusionError, Heightmap, View, Workspace};
-use nalgebra::Isometry2;
+use nalgebra::{Isometry2, UnitComplex, Vector2};
 use pick_place::{ExecuteError, Outcome, PickPlace, PrimitiveSettings};
+use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
 use std::time::Duration;
 use ur5::WorkCell;
 
 /// Stream of the seed's random numbers that the demonstrator draws from; the modules use 0, 1, ...
 const DEMONSTRATOR_STREAM: u64 = 1 << 32;
+/// Stream that disturbances are drawn from.
+const DISTURBANCE_STREAM: u64 = 1 << 35;
+/// A disturbed action grips at most so far beside what was meant along x and y, ...
+const GRIP_BESIDE_M: f64 = 0.03;
+/// ... or sets down so far beside it, ...
+const SET_DOWN_BESIDE_M: f64 = 0.05;
+/// ... turned by at most this against it.
+const SET_DOWN_TURNED_RAD: f64 = 0.6;
 
 /// A problem in a simulated work cell.
 ///
@@ -24,6 +33,7 @@ pub struct Environment {
     cell: Cell,
     tasks: Vec<Progress>,
     demonstrator: ChaCha8Rng,
+    disturber: ChaCha8Rng,
     /// What the demonstrator's last action does in the present state, if it has rehearsed it.
     foretold: Option<(PickPlace, Rehearsal)>,
     /// The order in which the demonstrator reaches the goals, if it is told one.
@@ -150,6 +160,7 @@ impl Environment {
             cell: Cell::new(work_cell),
             tasks: Vec::new(),
             demonstrator: stream(0, DEMONSTRATOR_STREAM),
+            disturber: stream(0, DISTURBANCE_STREAM),
             foretold: None,
             order: Vec::new(),
             seed: 0.into(),
@@ -169,6 +180,7 @@ impl Environment {
         self.cell.clear();
         self.foretold = None;
         self.demonstrator = stream(seed.start, DEMONSTRATOR_STREAM);
+        self.disturber = stream(seed.start, DISTURBANCE_STREAM);
         for (index, placement) in self.problem.modules().iter().enumerate() {
             let mut draws = Draws::new(seed, index as u64);
             let world = self.cell.world_mut();
@@ -231,6 +243,38 @@ impl Environment {
                 .demonstrate(&self.cell, &mut self.demonstrator, next)?;
         self.foretold = rehearsal.map(|rehearsal| (action, rehearsal));
         Some(action)
+    }
+
+    /// With a probability carries out, badly, what the demonstrator means to do next: it grips or sets
+    /// down beside, as a policy may miss. That is no step of the episode, and the demonstrator goes on
+    /// from what came of it. Says whether it did.
+    pub fn disturb(&mut self, probability: f64) -> Result<bool, EnvironmentError> {
+        if self.is_complete() || !self.disturber.random_bool(probability.clamp(0.0, 1.0)) {
+            return Ok(false);
+        }
+        let (Some(settings), Some(mut action)) = (self.settings(), self.demonstrate()) else {
+            return Ok(false);
+        };
+        self.foretold = None;
+        let grips_beside = self.disturber.random_bool(0.5);
+        let mut off = || self.disturber.random_range(-1.0..1.0);
+        let beside = Vector2::new(off(), off());
+        if grips_beside {
+            action.pick.translation.vector += beside * GRIP_BESIDE_M;
+        } else {
+            action.place.translation.vector += beside * SET_DOWN_BESIDE_M;
+            action.place.rotation *= UnitComplex::new(off() * SET_DOWN_TURNED_RAD);
+        }
+        // At the edge of the workspace there is not always a beside.
+        if check(&action).is_err() {
+            return Ok(false);
+        }
+        let arm = self.cell.work_cell().arm.clone();
+        pick_place::execute(&mut self.cell, &arm, &action, &settings, |_| ())?;
+        for progress in &mut self.tasks {
+            progress.reached = progress.task.goals_reached(self.cell.world());
+        }
+        Ok(true)
     }
 
     /// Carries out an action with the settings of the module being solved, and assesses it. What the

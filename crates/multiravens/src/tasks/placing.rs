@@ -36,6 +36,8 @@ const STRIP_M: (f64, f64) = (0.12, 0.2);
 const STRIP_LENGTH_M: f64 = 0.42;
 /// ... with at least this gap.
 const START_GAP_M: f64 = 0.01;
+/// Places drawn for a disk that is in the way.
+const ASIDE_DRAWS: usize = 200;
 /// A disk lies on the plate if its centre is this close to the height where it should be, ...
 const HEIGHT_TOLERANCE_M: f64 = 2e-3;
 /// ... and its axis this close to upright.
@@ -236,6 +238,41 @@ impl PlacingTask {
             })
     }
 
+    /// Puts aside a disk that is in the way where another one belongs, to where it could start.
+    fn put_aside(&self, next: Option<usize>, world: &World, rng: &mut ChaCha8Rng) -> Option<Move> {
+        let open = self.cells.iter().enumerate().filter(|(index, cell)| {
+            next.is_none_or(|next| next == *index) && !self.holds_goal(cell, world)
+        });
+        let open: Vec<_> = open.map(|(_, cell)| cell.center).collect();
+        let in_the_way = self.disks.iter().filter(|disk| {
+            let center = world.position(disk.body).xy();
+            let near = |cell: &Point2<f64>| (center - cell).norm() < disk.radius_m + BIG_RADIUS_M;
+            !self.is_placed(disk, world) && !self.is_covered(disk, world) && open.iter().any(near)
+        });
+        let in_the_way: Vec<_> = in_the_way.collect();
+        let disk = in_the_way.choose(rng)?;
+        let anchor = Isometry2::new(self.cells[4].center.coords, self.yaw_rad);
+        let along = STRIP_LENGTH_M / 2.0 - disk.radius_m;
+        let mut spots = (0..ASIDE_DRAWS).map(|_| {
+            let x = rng.random_range(-along..along);
+            let y = rng.random_range(STRIP_M.0 + disk.radius_m..STRIP_M.1 - disk.radius_m);
+            let side = if rng.random_bool(0.5) { 1.0 } else { -1.0 };
+            anchor * Point2::new(x, side * y)
+        });
+        let spot = spots.find(|spot| {
+            let mut others = self.disks.iter().filter(|other| other.body != disk.body);
+            others.all(|other| {
+                let off = (world.position(other.body).xy() - spot).norm();
+                off > disk.radius_m + other.radius_m + START_GAP_M / 2.0
+            })
+        })?;
+        let action = PickPlace {
+            pick: Isometry2::new(world.position(disk.body).xy().coords, 0.0),
+            place: Isometry2::new(spot.coords, 0.0),
+        };
+        Some(action.into())
+    }
+
     fn is_covered(&self, disk: &Disk, world: &World) -> bool {
         let center = world.position(disk.body);
         self.disks.iter().any(|other| {
@@ -277,7 +314,7 @@ impl Task for PlacingTask {
 
     /// A random disk that is not placed yet and nothing lies on, to a random free cell of its
     /// parity, or to the next one. The disk is gripped near its centre and set down so that its centre
-    /// meets the cell's.
+    /// meets the cell's. Where there is none, a disk in the way is put aside.
     fn demonstrate(
         &mut self,
         cell: &crate::Cell,
@@ -300,7 +337,9 @@ impl Task for PlacingTask {
                 moves.push((disk, cells));
             }
         }
-        let (disk, cells) = moves.choose(rng)?;
+        let Some((disk, cells)) = moves.choose(rng) else {
+            return self.put_aside(next, world, rng);
+        };
         let cell = cells.choose(rng)?;
         // Uniform over a small circle.
         let radius =

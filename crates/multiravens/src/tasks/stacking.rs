@@ -38,6 +38,10 @@ const ARRAY_PITCH_M: f64 = 0.06;
 const STAND_AT_M: (f64, f64) = (-0.13, -0.05);
 const ARRAY_AT_M: (f64, f64) = (0.06, -0.05);
 const MAX_SHIFT_M: f64 = 0.01;
+/// A block that is in the way is put somewhere here: x, and y, in the module frame; ...
+const ASIDE_M: ((f64, f64), (f64, f64)) = ((0.0, 0.1), (-0.115, 0.015));
+/// ... found by so many draws.
+const ASIDE_DRAWS: usize = 200;
 const FOOTPRINT_M: (f64, f64) = (0.44, 0.29);
 const COLORS: [[u8; 3]; 6] = [
     colors::RED,
@@ -100,6 +104,8 @@ struct Goal {
 struct StackingTask {
     /// From the lowest row to the top, see [`ROWS`].
     goals: Vec<Goal>,
+    /// Pose of the module.
+    anchor: Isometry2<f64>,
     /// Pose of the stand.
     stand: Isometry2<f64>,
     parameters: Stacking,
@@ -189,6 +195,7 @@ impl Stacking {
         });
         StackingTask {
             goals: goals.collect(),
+            anchor: *anchor,
             stand,
             parameters: *self,
         }
@@ -215,6 +222,46 @@ impl StackingTask {
     fn row(&self, world: &World) -> Option<&[Goal]> {
         let mut rows = ROWS.iter().map(|(first, end)| &self.goals[*first..*end]);
         rows.find(|row| !row.iter().all(|goal| self.is_reached(goal, world)))
+    }
+
+    /// Puts aside the topmost block that covers one that is needed, or stands where it belongs.
+    fn put_aside(&self, next: Option<BodyId>, world: &World, rng: &mut ChaCha8Rng) -> Option<Move> {
+        let wanted = self.row(world)?.iter().filter(|goal| {
+            next.is_none_or(|next| next == goal.block) && !self.is_reached(goal, world)
+        });
+        let mut in_the_way = Vec::new();
+        for goal in wanted {
+            let block = world.position(goal.block);
+            for (at, above_m) in [
+                (block.xy(), block.z),
+                (goal.center.xy(), goal.center.z - BLOCK_M / 2.0),
+            ] {
+                let blocks = self.goals.iter().map(|goal| goal.block);
+                let over = blocks.filter(|other| {
+                    let center = world.position(*other);
+                    *other != goal.block
+                        && center.z > above_m
+                        && (center.xy() - at).norm() < BLOCK_M
+                });
+                let height = |block: &BodyId| world.position(*block).z;
+                in_the_way.extend(over.max_by(|a, b| height(a).total_cmp(&height(b))));
+            }
+        }
+        let block = *in_the_way.choose(rng)?;
+        let mut spots = (0..ASIDE_DRAWS).map(|_| {
+            let x = rng.random_range(ASIDE_M.0.0..ASIDE_M.0.1);
+            let y = rng.random_range(ASIDE_M.1.0..ASIDE_M.1.1);
+            self.anchor * Point2::new(x, y)
+        });
+        let spot = spots.find(|spot| {
+            let mut others = self.goals.iter().filter(|goal| goal.block != block);
+            others.all(|goal| (world.position(goal.block).xy() - spot).norm() > 1.5 * BLOCK_M)
+        })?;
+        let action = PickPlace {
+            pick: Isometry2::new(world.position(block).xy().coords, 0.0),
+            place: Isometry2::new(spot.coords, 0.0),
+        };
+        Some(action.into())
     }
 
     /// Whether something lies where a column of one block's edge length stands, above a height.
@@ -272,7 +319,8 @@ impl Task for StackingTask {
     }
 
     /// A random block of the lowest row that is not complete, to its goal: gripped near the centre
-    /// of its top, and turned no further than it takes.
+    /// of its top, and turned no further than it takes. Where none can be moved, what is in the way is put
+    /// aside.
     fn demonstrate(
         &mut self,
         cell: &Cell,
@@ -292,7 +340,9 @@ impl Task for StackingTask {
                 && !occupied
         });
         let row: Vec<_> = row.collect();
-        let goal = row.choose(rng)?;
+        let Some(goal) = row.choose(rng) else {
+            return self.put_aside(next, world, rng);
+        };
         // Uniform over a small circle.
         let radius = self.parameters.pick_spread_m * rng.random_range(0.0..1.0f64).sqrt();
         let angle = rng.random_range(0.0..TAU);
@@ -387,10 +437,12 @@ mod tests {
         }
         rest(&mut world);
         assert_eq!(task.reached(&world), 2);
-        // Nor is there a way to go on but to take the tower down.
+        // There is no way to go on but to take the tower down, from its top.
         let mut rng = ChaCha8Rng::seed_from_u64(0);
         let next = task.demonstrate(&Cell::around(&world), &mut rng, None);
-        assert!(next.is_none());
+        let pick = next.unwrap().action.pick.translation.vector;
+        let top = world.position(task.goals[4].block).xy();
+        assert!((pick - top.coords).norm() < 1e-6);
         // Floating where it should be, with nothing below.
         let (mut world, mut task) = scene(4);
         put(&mut world, &task, 5, 5, EXACT);

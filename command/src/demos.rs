@@ -7,7 +7,7 @@ use anyhow::{Context, Result, bail};
 use bags::Demonstration;
 use clap::Args;
 use cpu_time::ProcessTime;
-use learning::{demonstrate, demonstrate_in_order, demonstration_path, replay, wilson_95};
+use learning::{demonstrate, demonstrate_disturbed, demonstration_path, replay, wilson_95};
 use multiravens::{Environment, EpisodeSeed, Problem};
 use serde::Serialize;
 use std::path::{Path, PathBuf};
@@ -31,6 +31,10 @@ pub struct Demos {
     /// starts SEED + 2, SEED + 4, ..., with the goals reached in the same order
     #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u64).range(1..=1000))]
     starts: u64,
+    /// Probability, before each step, that it is first carried out badly: gripped or set down beside. That is no step of the
+    /// demonstration, which goes on from what came of it. With --starts the demonstration that sets the order stays clean
+    #[arg(long, default_value_t = 0.0, value_parser = probability)]
+    disturb: f64,
     /// Draw instead, into this folder: the problem [default: all], its demonstration of the seed
     /// [default: 0] as pictures and an animation
     #[arg(long, conflicts_with_all = ["episodes", "out", "threads", "json"])]
@@ -202,7 +206,10 @@ impl Demos {
             return Ok(episode);
         }
         let known = order.as_deref().unwrap_or_default();
-        let rollout = demonstrate_in_order(environment, seed, known).with_context(context)?;
+        let leads = self.starts > 1 && order.is_none();
+        let disturb = if leads { 0.0 } else { self.disturb };
+        let rollout =
+            demonstrate_disturbed(environment, seed, known, disturb).with_context(context)?;
         episode.complete = rollout.complete;
         if self.starts > 1 && rollout.complete {
             let reached = rollout.goal_order();
@@ -224,6 +231,12 @@ impl Demos {
         }
         Ok(episode)
     }
+}
+
+fn probability(text: &str) -> Result<f64, String> {
+    let value = text.parse::<f64>().ok();
+    let value = value.filter(|value| (0.0..=1.0).contains(value));
+    value.ok_or_else(|| format!("`{text}` is no probability, expected 0 to 1"))
 }
 
 /// Bytes of the files of a bag.

@@ -32,7 +32,9 @@ pub use goal::{NextStepOracle, goal, known_images, reached};
 pub use interval::{bootstrap_95, wilson_95};
 pub use recipe::{Recipe, RecipeError, Validation};
 pub use reliability::{Reliability, ReliabilityBin, Unasked, reliability};
-pub use rollout::{Rollout, demonstrate, demonstrate_in_order, replay, roll_out};
+pub use rollout::{
+    Rollout, demonstrate, demonstrate_disturbed, demonstrate_in_order, replay, roll_out,
+};
 pub use sampling::{ModuleWeights, Sampling, SamplingError, StepWeights};
 pub use search::{Search, SearchError, Trial, TrialSnapshot};
 pub use sweep::{Run, RunResult, Score, SnapshotResult, Sweep, Test};

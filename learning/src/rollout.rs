@@ -49,15 +49,35 @@ pub fn demonstrate_in_order(
     seed: impl Into<EpisodeSeed>,
     order: &[usize],
 ) -> Result<Rollout, EnvironmentError> {
-    roll_out(
+    demonstrate_disturbed(environment, seed, order, 0.0)
+}
+
+/// [`demonstrate_in_order`], disturbed before each step with a probability, see [`Environment::disturb`].
+/// What a disturbance does is no step: the next one begins from what came of it. A demonstration in which
+/// a disturbance reaches a goal is not complete, since no step shows how.
+pub fn demonstrate_disturbed(
+    environment: &mut Environment,
+    seed: impl Into<EpisodeSeed>,
+    order: &[usize],
+    probability: f64,
+) -> Result<Rollout, EnvironmentError> {
+    let mut spoiled = false;
+    let mut rollout = roll(
         environment,
-        seed,
-        |environment, _| {
+        seed.into(),
+        |environment| {
             environment.follow(order)?;
-            Ok(environment.demonstrate())
+            let before = environment.goals_reached();
+            let disturbed = environment.disturb(probability)?;
+            let after = environment.goals_reached();
+            spoiled |= after.iter().any(|goal| !before.contains(goal));
+            Ok(disturbed)
         },
+        |environment, _| Ok::<_, EnvironmentError>(environment.demonstrate()),
         |_, _| (),
-    )
+    )?;
+    rollout.complete &= !spoiled;
+    Ok(rollout)
 }
 
 /// Repeats the actions of a demonstration of this problem from the same start: the same states come of
@@ -79,15 +99,31 @@ pub fn replay(
 pub fn roll_out<E: From<EnvironmentError>>(
     environment: &mut Environment,
     seed: impl Into<EpisodeSeed>,
+    act: impl FnMut(&mut Environment, &Heightmap) -> Result<Option<PickPlace>, E>,
+    after: impl FnMut(&PickPlace, &StepReport),
+) -> Result<Rollout, E> {
+    roll(environment, seed.into(), |_| Ok(false), act, after)
+}
+
+/// [`roll_out`]; `before` is called before each step, and says whether it has moved anything.
+fn roll<E: From<EnvironmentError>>(
+    environment: &mut Environment,
+    seed: EpisodeSeed,
+    mut before: impl FnMut(&mut Environment) -> Result<bool, E>,
     mut act: impl FnMut(&mut Environment, &Heightmap) -> Result<Option<PickPlace>, E>,
     mut after: impl FnMut(&PickPlace, &StepReport),
 ) -> Result<Rollout, E> {
-    let seed = seed.into();
     environment.reset(seed)?;
     let mut steps = Vec::new();
     let mut goals_reached = Vec::new();
     let mut observation = environment.observe()?.clone();
-    while let (false, Some(settings)) = (environment.is_done(), environment.settings()) {
+    while !environment.is_done() {
+        if before(environment)? {
+            observation = environment.observe()?.clone();
+        }
+        let Some(settings) = environment.settings() else {
+            break;
+        };
         let Some(action) = act(environment, &observation)? else {
             break;
         };

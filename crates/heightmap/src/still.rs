@@ -234,8 +234,8 @@ impl StillFusion {
             let below = (v + 1 < height).then(|| &view.depth_m[(v + 1) * width..][..width]);
             for u in 0..width {
                 let depth_m = row[u];
-                // Not a number fails, and so does infinity below.
-                if !(depth_m > 0.0) {
+                // Infinity is outside, below.
+                if depth_m.is_nan() || depth_m <= 0.0 {
                     continue;
                 }
                 let [ray_x, ray_y] = rays[v * width + u];

@@ -7,11 +7,11 @@ use ::heightmap::{Distortion, Intrinsics};
 use serde_bytes::ByteBuf;
 
 /// Rows of an image without their padding, once the sizes are right.
-fn rows<'a>(
-    image: &'a sensor_msgs::Image,
+fn rows(
+    image: &sensor_msgs::Image,
     (width, height): (usize, usize),
     pixel_bytes: usize,
-) -> Result<impl Iterator<Item = &'a [u8]>, ConvertError> {
+) -> Result<impl Iterator<Item = &[u8]>, ConvertError> {
     let same = |field, actual: u32, expected: usize| {
         if actual as usize == expected {
             Ok(())

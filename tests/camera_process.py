@@ -1,7 +1,7 @@
 """One RGB-D camera as a process of its own: python tests/camera_process.py NAME BEGIN_S RATE_HZ SECONDS.
 
-It sends its first set of images at the time BEGIN_S (since the epoch), as other processes may do with theirs, in the ROS domain and with the
-Fast DDS profile of the environment.
+It sends its first set of images at the time BEGIN_S (since the epoch), as other processes may do with theirs, in the ROS domain and
+with the Fast DDS profile of the environment.
 """
 
 from __future__ import annotations

@@ -32,7 +32,7 @@ def test_heightmaps_reach_rclpy_whole_and_soon() -> None:
 
 @pytest.mark.parametrize("profile", [True, False], ids=["with the profile", "without it"])
 def test_cameras_on_fast_dds_lose_no_image(start, profile: bool) -> None:
-    """Three RGB-D cameras written with rclpy, a process each, with images of 0.9 and 1.2 MB at one moment; Fast DDS sends them in bursts."""
+    """Three RGB-D cameras of rclpy, a process each, send images of 0.9 and 1.2 MB at one moment; Fast DDS sends them in bursts."""
     rate_hz, seconds = 10, 4
     sets = rate_hz * seconds + 1
     domain = free_domain()
@@ -53,7 +53,9 @@ def test_cameras_on_fast_dds_lose_no_image(start, profile: bool) -> None:
             def counts() -> dict[str, dict[str, int]]:
                 said = operator.diagnosed("camera_fusion: topics")
                 words = {topic: said.get(topic, "").split() for topic in [*topics, "/heightmap"]}
-                return {topic: {k: int(v) for k, _, v in (word.partition("=") for word in all_) if v.isdigit()} for topic, all_ in words.items()}
+                return {
+                    topic: {k: int(v) for k, _, v in (word.partition("=") for word in all_) if v.isdigit()} for topic, all_ in words.items()
+                }
 
             def all_have_come() -> bool:
                 return all(count.get("messages", 0) >= sets for count in counts().values())

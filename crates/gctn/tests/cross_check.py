@@ -118,8 +118,7 @@ def compact_input(observation, goal):
 def sequence_input(observation, previous, image):
     """The 24 channels that the matching network reads."""
     seen, before, after = (
-        np.concatenate([h["rgb"].transpose(2, 0, 1) / 128 - 1.1, h["height_m"][None] / 0.04])
-        for h in (observation, previous, image)
+        np.concatenate([h["rgb"].transpose(2, 0, 1) / 128 - 1.1, h["height_m"][None] / 0.04]) for h in (observation, previous, image)
     )
     changes = after - before, after - seen
     sizes = [part for c in changes for part in (np.abs(c[:3]).mean(0, keepdims=True), np.abs(c[3:]))]

@@ -130,7 +130,7 @@ def matching(net, config, x):
     """As `shared`, and first place logits, logit of done."""
     network = config["network"]
     heads = F.relu(net.conv("heads", compact_trunk(net, config, x))).chunk(5, 1)
-    place, bias, query, key = (net.conv(name, head) for name, head in zip(("place", "bias", "query", "key"), heads))
+    place, bias, query, key = (net.conv(name, head) for name, head in zip(("place", "bias", "query", "key"), heads, strict=False))
     gate, done = torch.sigmoid(net.conv("gate", heads[3])), net.conv("done", heads[4])[0, 0]
     place = place[0, 0]
     attention = torch.softmax(place.detach().flatten(), 0).view_as(place)

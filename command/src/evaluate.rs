@@ -4,6 +4,7 @@ use crate::picture::scores;
 use crate::progress;
 use crate::root::Root;
 use anyhow::{Context, Result, bail};
+use camera_noise::Perturbation;
 use clap::{Args, ValueEnum};
 use gctn::Policy;
 use heightmap::picture::{self, RgbImage};
@@ -33,6 +34,9 @@ pub struct Evaluate {
     /// Seed of the first episode; the next ones are seed + 2, seed + 4, ... (test: from 10,000 up)
     #[arg(long)]
     seed: u64,
+    /// What the cameras do to observations and goals, a file as those of config/perturbations [default: perfect cameras]
+    #[arg(long)]
+    perturb: Option<PathBuf>,
     /// Episodes at a time [default: one per core]
     #[arg(long)]
     threads: Option<usize>,
@@ -77,6 +81,8 @@ impl Evaluate {
     pub fn run(self, root: &Root) -> Result<()> {
         let problem = root.problem(&self.problem)?;
         let work_cell = root.work_cell()?;
+        let perturbation = self.perturb.as_deref().map(Perturbation::load);
+        let perturbation = perturbation.transpose()?;
         let checkpoint = self.checkpoint.unwrap_or_else(|| root.shipped_checkpoint());
         let cores = std::thread::available_parallelism().map_or(1, |cores| cores.get());
         // One decision on one thread, several episodes at a time: the same bits whatever the machine.
@@ -96,11 +102,12 @@ impl Evaluate {
         };
         let bar = progress::bar(self.episodes as u64, "episodes");
         let failed = Mutex::new(Vec::new());
-        let report = evaluate(
+        let mut report = evaluate(
             &problem,
             &work_cell,
             &mut actors,
             &plan,
+            perturbation.as_ref(),
             |report, attempt| {
                 bar.inc(1);
                 if self.failures.is_some() && !report.completed {
@@ -110,6 +117,7 @@ impl Evaluate {
             },
         )?;
         bar.finish_and_clear();
+        report.perturb = self.perturb.map(|path| path.display().to_string());
         if let Some(folder) = &self.failures {
             std::fs::create_dir_all(folder).with_context(|| folder.display().to_string())?;
             let failed = failed.into_inner().expect("no thread panics with the lock");

@@ -107,7 +107,9 @@ impl SweepCommand {
                 start: Start::Same,
             };
             let bar = progress::bar(episodes as u64, "episodes");
-            let report = evaluate(&problem, &work_cell, &mut actors, &plan, |_, _| bar.inc(1))?;
+            let report = evaluate(&problem, &work_cell, &mut actors, &plan, None, |_, _| {
+                bar.inc(1)
+            })?;
             bar.finish_and_clear();
             Ok(Score {
                 episodes: report.episodes,

@@ -266,7 +266,7 @@ fn validate(root: &Root, recipe: &Recipe, snapshot: &mut Snapshot) -> Result<()>
     };
     for name in &recipe.problems {
         let problem = root.problem(name)?;
-        let report = evaluate(&problem, &work_cell, &mut actors, &plan, |_, _| ())?;
+        let report = evaluate(&problem, &work_cell, &mut actors, &plan, None, |_, _| ())?;
         tracing::info!("step {}: {}", snapshot.step, summary(&report));
         snapshot.completion.insert(name.clone(), report.completion);
         snapshot.reward.insert(name.clone(), report.reward);

@@ -5,6 +5,7 @@ use crate::goal::{NextStepOracle, goal};
 use crate::interval::bootstrap_95;
 use crate::rollout::{Rollout, demonstrate, roll_out};
 use bags::Demonstration;
+use camera_noise::Perturbation;
 use multiravens::{Environment, EnvironmentError, EpisodeSeed, Problem};
 use nalgebra::Isometry2;
 use serde::{Deserialize, Serialize};
@@ -140,6 +141,10 @@ pub enum EvaluationError {
 /// A demonstrator that needs more seeds than this for each episode is broken.
 const MAX_SEEDS_PER_EPISODE: u64 = 10;
 
+/// Sessions of perturbed cameras: light and colours were others when the demonstration was made.
+const SESSION_OF_DEMONSTRATION: u64 = 0;
+const SESSION_OF_ROLLOUT: u64 = 1;
+
 enum StepError {
     Environment(EnvironmentError),
     Policy(gctn::Error),
@@ -182,10 +187,12 @@ pub fn attempt(
         seed,
         source: Box::new(error),
     };
+    environment.set_session(SESSION_OF_DEMONSTRATION);
     let shown = demonstrate(environment, start.shown(seed)).map_err(failed)?;
     if !shown.complete {
         return Ok(None);
     }
+    environment.set_session(SESSION_OF_ROLLOUT);
     let goals = shown.demonstration.goals();
     let conditioning = actor.conditioning();
     let oracle = RefCell::new(NextStepOracle::new(goals.len()));
@@ -251,12 +258,13 @@ pub fn attempt(
 }
 
 /// Evaluates on episodes. One thread for each actor given, which must all be alike; the result does not depend on how
-/// many. `progress` is told of each episode as it comes.
+/// many. With a perturbation, observations and goals are what such cameras see. `progress` is told of each episode as it comes.
 pub fn evaluate(
     problem: &Problem,
     work_cell: &WorkCell,
     actors: &mut [Actor],
     plan: &Episodes,
+    perturbation: Option<&Perturbation>,
     progress: impl Fn(&EpisodeReport, &Attempt) + Sync,
 ) -> Result<Evaluation, EvaluationError> {
     let Episodes {
@@ -271,6 +279,7 @@ pub fn evaluate(
     // last needed episode is cut off below, so that the number of threads does not matter.
     let work = |actor: &mut Actor| -> Result<(), EvaluationError> {
         let mut environment = Environment::new(problem, work_cell);
+        environment.set_perturbation(perturbation);
         loop {
             let done = outcomes
                 .lock()

@@ -3,7 +3,9 @@
 use crate::render::{RenderError, RgbdImage};
 use crate::stage::Stage;
 use crate::world::{self, World};
+use camera_noise::ClutterItem;
 use heightmap::{Camera, Intrinsics, View};
+use nalgebra::Vector3;
 use pick_place::{ExecuteError, Outcome, PickPlace, PrimitiveSettings, Robot};
 use std::time::Duration;
 use ur5::{JointTrajectory, Joints, WorkCell};
@@ -371,6 +373,11 @@ impl Cell {
         self.suction = rehearsal.suction;
         self.settled = rehearsal.settled;
         rehearsal.outcome
+    }
+
+    /// Lights the scene from another side and adds boxes that are seen and that nothing touches, until this is called again.
+    pub fn perturb(&mut self, light: Vector3<f64>, clutter: Vec<ClutterItem>) {
+        self.stage.perturb(light, clutter);
     }
 
     /// What the cameras see now.

@@ -2,11 +2,14 @@
 
 use crate::cell::{Cell, CellError, Rehearsal, Watched};
 use crate::problem::Problem;
-use crate::render::RenderError;
+use crate::render::{LIGHT, RenderError, RgbdImage};
 use crate::seed::{Draws, EpisodeSeed, stream};
 use crate::tasks::{Move, ParameterError, Task};
-use heightmap::{Fusion, FusionError, Heightmap, View, Workspace};
-use nalgebra::{Isometry2, UnitComplex, Vector2};
+use camera_noise::{ClutterItem, Perturbation, Rig};
+use heightmap::{
+    Camera, Fusion, FusionError, Heightmap, StillFusion, StillSettings, View, Workspace,
+};
+use nalgebra::{Isometry2, UnitComplex, Vector2, Vector3};
 use pick_place::{ExecuteError, Outcome, PickPlace, PrimitiveSettings};
 use rand::RngExt;
 use rand_chacha::ChaCha8Rng;
@@ -42,6 +45,44 @@ pub struct Environment {
     steps: usize,
     fusion: Fusion,
     heightmap: Heightmap,
+    perturbed: Option<Perturbed>,
+}
+
+/// What the cameras do to the images of this environment.
+struct Perturbed {
+    model: Perturbation,
+    session: u64,
+    rig: Rig,
+    /// Images taken in this session by each camera.
+    frame: u64,
+    fusion: StillFusion,
+}
+
+impl Perturbed {
+    /// The images that the cameras take of clean views, each with the camera as the fusion believes it to stand.
+    fn take(&mut self, views: &[View<'_>]) -> Vec<(Camera, RgbdImage)> {
+        let mut images = Vec::new();
+        for (index, view) in views.iter().enumerate() {
+            if self.rig.is_missing(index) {
+                continue;
+            }
+            let mut image = RgbdImage {
+                rgb: view.rgb.to_vec(),
+                depth_m: view.depth_m.to_vec(),
+            };
+            let intrinsics = &view.camera.intrinsics;
+            self.rig.apply(
+                index,
+                intrinsics,
+                self.frame,
+                &mut image.rgb,
+                &mut image.depth_m,
+            );
+            images.push((self.rig.believed(index, view.camera), image));
+        }
+        self.frame += 1;
+        images
+    }
 }
 
 struct Progress {
@@ -167,7 +208,69 @@ impl Environment {
             steps: 0,
             fusion: Fusion::default(),
             heightmap: Heightmap::new(Workspace::RAVENS),
+            perturbed: None,
         }
+    }
+
+    /// Lets the cameras do what the model says, from the next reset on; `None`: they are perfect.
+    pub fn set_perturbation(&mut self, model: Option<&Perturbation>) {
+        self.perturbed = model.map(|model| Perturbed {
+            model: model.clone(),
+            session: 0,
+            rig: Rig::draw(model, self.cell.cameras(), 0, 0),
+            frame: 0,
+            fusion: StillFusion::new(StillSettings {
+                frames: model.frames,
+                ..StillSettings::default()
+            }),
+        });
+        if model.is_none() {
+            self.cell.perturb(LIGHT, Vec::new());
+        }
+    }
+
+    /// Which session of the cameras the next reset begins. The errors of the calibration are drawn from the scene's seed alone, light,
+    /// colours, clutter and noise from the session too: a demonstration and its repetition are two sessions.
+    pub fn set_session(&mut self, session: u64) {
+        if let Some(perturbed) = &mut self.perturbed {
+            perturbed.session = session;
+        }
+    }
+
+    /// What the cameras do in this episode, if they are not perfect.
+    pub fn rig(&self) -> Option<&Rig> {
+        self.perturbed.as_ref().map(|perturbed| &perturbed.rig)
+    }
+
+    /// Draws the rig of this episode; clutter that would stand in a body of the task is left out.
+    fn draw_rig(&mut self) {
+        let Some(perturbed) = &mut self.perturbed else {
+            return;
+        };
+        let cameras = self.cell.cameras();
+        let rig = Rig::draw(
+            &perturbed.model,
+            cameras,
+            self.seed.scene,
+            perturbed.session,
+        );
+        let world = self.cell.world();
+        let free = |item: &&ClutterItem| {
+            world.bodies().all(|body| {
+                let pose = world.pose(body);
+                let away = item.pose.translation.vector.xy() - pose.translation.vector.xy();
+                // No farther than this does a shape reach along the table, however it is turned.
+                let shape = world.shape(body);
+                let axes = [Vector3::x(), Vector3::y(), Vector3::z()];
+                let reach_m = Vector3::from(axes.map(|axis| shape.extent_m(&axis))).norm();
+                away.norm() > 0.5 * item.size_m.norm() + reach_m
+            })
+        };
+        let clutter = rig.clutter().iter().filter(free).copied().collect();
+        let light = rig.light(&LIGHT);
+        perturbed.rig = rig;
+        perturbed.frame = 0;
+        self.cell.perturb(light, clutter);
     }
 
     /// Begins the episode of a seed: a number alone is a scene with its own start.
@@ -204,14 +307,25 @@ impl Environment {
         for progress in &mut self.tasks {
             progress.reached = progress.task.goals_reached(self.cell.world());
         }
+        self.draw_rig();
         Ok(())
     }
 
-    /// What the three cameras see, fused.
+    /// What the three cameras see, fused; with a perturbation the median of as many frames as it says.
     pub fn observe(&mut self) -> Result<&Heightmap, EnvironmentError> {
         self.cell.render()?;
         let views: Vec<View<'_>> = self.cell.views().collect();
-        self.fusion.fuse(&views, &mut self.heightmap)?;
+        let Some(perturbed) = &mut self.perturbed else {
+            self.fusion.fuse(&views, &mut self.heightmap)?;
+            return Ok(&self.heightmap);
+        };
+        perturbed.fusion.forget();
+        for _ in 0..perturbed.model.frames {
+            let images = perturbed.take(&views);
+            let taken: Vec<View<'_>> = images.iter().map(|(c, i)| i.view(c)).collect();
+            perturbed.fusion.push(&taken, &Workspace::RAVENS)?;
+        }
+        perturbed.fusion.median(&mut self.heightmap);
         Ok(&self.heightmap)
     }
 

@@ -3,7 +3,9 @@
 use crate::colors;
 use crate::render::{Mesh, MeshId, Rasteriser, RenderError, RgbdImage, Scene};
 use crate::world::World;
+use camera_noise::ClutterItem;
 use heightmap::{Camera, View};
+use nalgebra::Vector3;
 use ur5::{Joints, Shape, WorkCell};
 
 /// Edges of what approximates a circle.
@@ -17,6 +19,8 @@ pub(crate) struct Stage {
     images: Vec<RgbdImage>,
     rasteriser: Rasteriser,
     meshes: Vec<(Shape, MeshId)>,
+    /// Shown and in nobody's way.
+    clutter: Vec<ClutterItem>,
 }
 
 impl Stage {
@@ -28,7 +32,14 @@ impl Stage {
             cameras,
             rasteriser: Rasteriser::new(),
             meshes: Vec::new(),
+            clutter: Vec::new(),
         }
+    }
+
+    /// Sets what a perturbation adds to the scene, until it is set again.
+    pub(crate) fn perturb(&mut self, light: Vector3<f64>, clutter: Vec<ClutterItem>) {
+        self.scene.light = light;
+        self.clutter = clutter;
     }
 
     pub(crate) fn cameras(&self) -> &[Camera] {
@@ -59,6 +70,12 @@ impl Stage {
                 let pose = world.pose(body) * component.pose;
                 self.scene.add(mesh, pose, world.rgb(body));
             }
+        }
+        for item in self.clutter.clone() {
+            let mesh = self.mesh(Shape::Cuboid {
+                size_m: item.size_m,
+            });
+            self.scene.add(mesh, item.pose, item.rgb);
         }
         for (camera, image) in self.cameras.iter().zip(&mut self.images) {
             self.rasteriser

@@ -8,10 +8,12 @@ use std::thread;
 use std::time::{Duration, Instant};
 
 use anyhow::Context as _;
+use camera_noise::{Perturbation, Rig};
+use heightmap::Camera;
 use msgs::control_msgs::{
     FollowJointTrajectory, FollowJointTrajectoryFeedback, FollowJointTrajectoryResult,
 };
-use msgs::convert;
+use msgs::convert::{self, ConvertError};
 use msgs::rosgraph_msgs::Clock;
 use msgs::sctn_msgs::{ResetCell, ResetCellRequest, ResetCellResponse, Reward};
 use msgs::sensor_msgs::JointState;
@@ -23,6 +25,7 @@ use msgs::ur_msgs::{
     FollowJointTrajectoryUntil, FollowJointTrajectoryUntilFeedback,
     FollowJointTrajectoryUntilResult, IOStates, SetIO, SetIORequest, SetIOResponse,
 };
+use multiravens::render::RgbdImage;
 use multiravens::{MotionEnd, Problem};
 use node_kit::{Active, Level, NewGoal, Node, Once, Publisher, Qos, RunningGoal};
 use tokio::sync::oneshot;
@@ -54,14 +57,21 @@ pub async fn configure(
         path => WorkCell::load(path),
     }
     .context("parameter urdf")?;
+    if let Some(warning) = work_cell.warning() {
+        warn!("parameter urdf: {warning}");
+    }
     let wiring = Wiring {
         suction_pin: parameters.suction_pin,
         vacuum_pin: parameters.vacuum_pin,
     };
+    let perturbation = match parameters.perturbation.as_path() {
+        path if path == Path::new("") => None,
+        path => Some(Perturbation::load(path).context("parameter perturbation")?),
+    };
     let seed = parameters.seed;
     let workcell = tokio::task::spawn_blocking({
         let work_cell = work_cell.clone();
-        move || Workcell::new(&problem, &work_cell, seed, wiring)
+        move || Workcell::new(&problem, &work_cell, seed, wiring, perturbation)
     })
     .await
     .context("setting up the episode")??;
@@ -279,14 +289,19 @@ struct Hardware {
     io_states: Publisher<IOStates>,
     reward: Publisher<Reward>,
     cameras: Vec<CameraTopics>,
+    /// Latched.
+    tf_static: Publisher<TFMessage>,
     /// Latched, said once; kept so that late joiners hear them.
-    _tf_static: Publisher<TFMessage>,
     _robot_description: Option<Publisher<std_msgs::String>>,
     _robot_mode: Publisher<RobotMode>,
     _safety_mode: Publisher<SafetyMode>,
     _program_running: Publisher<Bool>,
-    /// What the cameras saw at this rest.
-    frames: Vec<Frame>,
+    /// What the cameras saw at this rest: one set of frames of perfect cameras, several of noisy ones.
+    frames: Vec<Vec<(usize, Frame)>>,
+    /// Which set is said next.
+    next_set: usize,
+    /// Sets taken of noisy cameras so far.
+    sets_taken: u64,
     resets: Once<ResetCellResponse>,
     said_pins: IOStates,
     /// When the last command ended.
@@ -294,6 +309,66 @@ struct Hardware {
     next_status: Instant,
     next_pins: Instant,
     next_frames: Instant,
+}
+
+/// Where the cameras are, as their calibration has it, and the links that stand still.
+fn fixed_transforms(
+    workcell: &Workcell,
+    work_cell: &WorkCell,
+    parameters: &SimWorkcellParameters,
+) -> Result<TFMessage, ConvertError> {
+    let environment = workcell.environment();
+    let cameras = environment.cell().cameras().iter().enumerate();
+    let believed: Vec<Camera> = cameras
+        .map(|(index, camera)| match environment.rig() {
+            Some(rig) => rig.believed(index, camera),
+            None => camera.clone(),
+        })
+        .collect();
+    let (world, time) = (&parameters.world_frame, workcell.time());
+    let mut fixed = camera_transforms(&believed, world, time)?;
+    if parameters.publish_robot {
+        let links = link_transforms(work_cell, &work_cell.arm.home, false, world, time)?;
+        fixed.transforms.extend(links.transforms);
+    }
+    Ok(fixed)
+}
+
+/// Period of noisy cameras: 30 Hz.
+const NOISY_PERIOD: Duration = Duration::from_nanos(33_333_333);
+/// They run free: each takes its images this much after the one before it, so that the first and the last of three are 14 ms apart.
+const NOISY_OFFSET: Duration = Duration::from_millis(7);
+
+/// What noisy cameras take of a still scene: as many sets as their model says, one after the other, each image with noise of its own.
+fn noisy_sets(
+    rig: &Rig,
+    cameras: &[Camera],
+    images: &[RgbdImage],
+    time: Duration,
+    taken: u64,
+) -> Result<Vec<Vec<(usize, Frame)>>, ConvertError> {
+    let mut sets = Vec::new();
+    for set in 0..rig.model().frames as u32 {
+        let mut frames = Vec::new();
+        for (index, (camera, image)) in cameras.iter().zip(images).enumerate() {
+            if rig.is_missing(index) {
+                continue;
+            }
+            let mut image = image.clone();
+            let frame = taken + u64::from(set);
+            rig.apply(
+                index,
+                &camera.intrinsics,
+                frame,
+                &mut image.rgb,
+                &mut image.depth_m,
+            );
+            let stamp = time + set * NOISY_PERIOD + index as u32 * NOISY_OFFSET;
+            frames.push((index, Frame::new(camera, &image, stamp)?));
+        }
+        sets.push(frames);
+    }
+    Ok(sets)
 }
 
 impl Hardware {
@@ -311,18 +386,9 @@ impl Hardware {
             .map(|camera| CameraTopics::new(node, &camera.name));
         let topics = topics.collect::<Result<_, _>>()?;
         let tf_static = node.publisher("/tf_static", Qos::Latched)?;
-        let mut fixed = camera_transforms(cameras, &parameters.world_frame, workcell.time())?;
         let robot_description = match parameters.publish_robot {
             false => None,
             true => {
-                let links = link_transforms(
-                    &work_cell,
-                    &work_cell.arm.home,
-                    false,
-                    &parameters.world_frame,
-                    workcell.time(),
-                )?;
-                fixed.transforms.extend(links.transforms);
                 let description = node.publisher("robot_description", Qos::Latched)?;
                 description.publish(std_msgs::String {
                     data: work_cell.urdf.clone(),
@@ -330,7 +396,7 @@ impl Hardware {
                 Some(description)
             }
         };
-        tf_static.publish(fixed);
+        tf_static.publish(fixed_transforms(&workcell, &work_cell, &parameters)?);
         let status = |name| format!("io_and_status_controller/{name}");
         let robot_mode = node.publisher(&status("robot_mode"), Qos::Latched)?;
         robot_mode.publish(RobotMode {
@@ -361,11 +427,13 @@ impl Hardware {
             commands,
             stop,
             cameras: topics,
-            _tf_static: tf_static,
+            tf_static,
             _robot_mode: robot_mode,
             _safety_mode: safety_mode,
             _program_running: program_running,
             frames: Vec::new(),
+            next_set: 0,
+            sets_taken: 0,
             resets: Once::default(),
             last_command: Instant::now(),
             next_status: Instant::now(),
@@ -489,6 +557,14 @@ impl Hardware {
                 info!("reset: problem {name}, seed {seed}");
                 self.parameters.problem = name;
                 self.parameters.seed = seed;
+                if self.workcell.environment().rig().is_some() {
+                    // The errors of the calibration are those of the seed.
+                    self.tf_static.publish(fixed_transforms(
+                        &self.workcell,
+                        &self.work_cell,
+                        &self.parameters,
+                    )?);
+                }
                 self.say_pins();
                 self.say_status()?;
                 self.look()?;
@@ -621,14 +697,21 @@ impl Hardware {
         if !settled {
             warn!("the bodies have not come to rest; the frames show them in motion");
         }
+        let rig = self.workcell.environment().rig().cloned();
         let cell = self.workcell.environment_mut().cell_mut();
         let cameras = cell.cameras().to_vec();
         let images = cell.render()?;
-        self.frames = cameras
-            .iter()
-            .zip(images)
-            .map(|(camera, image)| Frame::new(camera, image, time))
-            .collect::<Result<_, _>>()?;
+        self.frames = match &rig {
+            None => {
+                let frames = cameras.iter().zip(images).enumerate();
+                let frames = frames
+                    .map(|(index, (camera, image))| Ok((index, Frame::new(camera, image, time)?)));
+                vec![frames.collect::<Result<_, ConvertError>>()?]
+            }
+            Some(rig) => noisy_sets(rig, &cameras, images, time, self.sets_taken)?,
+        };
+        self.sets_taken += self.frames.len() as u64;
+        self.next_set = 0;
         self.say_frames();
         let environment = self.workcell.environment();
         let level = if settled { Level::Ok } else { Level::Warn };
@@ -702,10 +785,16 @@ impl Hardware {
     }
 
     fn say_frames(&mut self) {
-        for (camera, frame) in self.cameras.iter().zip(&self.frames) {
-            camera.publish(frame.clone());
+        for (camera, frame) in self.frames.get(self.next_set).into_iter().flatten() {
+            self.cameras[*camera].publish(frame.clone());
         }
-        self.next_frames = self.after(self.parameters.frames_period_s);
+        self.next_set += 1;
+        if self.next_set < self.frames.len() {
+            self.next_frames = self.after(NOISY_PERIOD.as_secs_f64());
+        } else {
+            self.next_set = 0;
+            self.next_frames = self.after(self.parameters.frames_period_s);
+        }
     }
 
     fn status_period_s(&self) -> f64 {

@@ -38,6 +38,8 @@ pub struct SimWorkcellParameters {
     pub status_period_s: f64,
     /// Wall seconds between repeats of the camera frames while nothing moves.
     pub frames_period_s: f64,
+    /// What the cameras do: a file as those of config/perturbations; empty for perfect ones.
+    pub perturbation: PathBuf,
 }
 
 impl Default for SimWorkcellParameters {
@@ -57,6 +59,7 @@ impl Default for SimWorkcellParameters {
             joint_states_rate_hz: 50.0,
             status_period_s: 0.02,
             frames_period_s: 1.0,
+            perturbation: PathBuf::new(),
         }
     }
 }

@@ -3,6 +3,7 @@
 use std::collections::BTreeMap;
 use std::time::Duration;
 
+use camera_noise::Perturbation;
 use msgs::control_msgs::FollowJointTrajectoryResult;
 use msgs::ur_msgs::{Digital, IOStates, SetIORequest};
 use multiravens::{Assessment, Environment, EnvironmentError, MotionEnd, Problem, Tick};
@@ -29,6 +30,8 @@ pub(crate) struct Workcell {
     /// Simulated time of the episodes before: time never runs back.
     past: Duration,
     wiring: Wiring,
+    /// What the cameras do; perfect ones without.
+    perturbation: Option<Perturbation>,
     /// Digital outputs that are not suction.
     outputs: BTreeMap<u8, bool>,
     flags: BTreeMap<u8, bool>,
@@ -54,13 +57,16 @@ impl Workcell {
         work_cell: &WorkCell,
         seed: u64,
         wiring: Wiring,
+        perturbation: Option<Perturbation>,
     ) -> Result<Self, EnvironmentError> {
         let mut environment = Environment::new(problem, work_cell);
+        environment.set_perturbation(perturbation.as_ref());
         environment.reset(seed)?;
         Ok(Self {
             environment,
             past: Duration::ZERO,
             wiring,
+            perturbation,
             outputs: (0..PINS).map(|pin| (pin, false)).collect(),
             flags: BTreeMap::new(),
             velocities_rad_s: Joints::zeros(),
@@ -76,7 +82,13 @@ impl Workcell {
         work_cell: &WorkCell,
         seed: u64,
     ) -> Result<(), EnvironmentError> {
-        let next = Self::new(problem, work_cell, seed, self.wiring)?;
+        let next = Self::new(
+            problem,
+            work_cell,
+            seed,
+            self.wiring,
+            self.perturbation.clone(),
+        )?;
         let past = self.time() + PAUSE;
         *self = Self { past, ..next };
         Ok(())
@@ -258,7 +270,7 @@ mod tests {
     fn workcell() -> (Workcell, WorkCell) {
         let work_cell = WorkCell::builtin().unwrap();
         (
-            Workcell::new(&problem(), &work_cell, 10_000, WIRING).unwrap(),
+            Workcell::new(&problem(), &work_cell, 10_000, WIRING, None).unwrap(),
             work_cell,
         )
     }

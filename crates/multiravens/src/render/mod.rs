@@ -23,5 +23,5 @@ mod workload;
 
 pub use mesh::{Mesh, MeshError};
 pub use raster::{FAR_M, NEAR_M, Rasteriser, RenderError, RgbdImage};
-pub use scene::{Instance, MeshId, Scene};
+pub use scene::{Instance, LIGHT, MeshId, Scene};
 pub use workload::crowded_table;

@@ -9,8 +9,6 @@ pub const NEAR_M: f64 = 0.01;
 /// Farther than this nothing is drawn, as in Ravens.
 pub const FAR_M: f64 = 10.0;
 
-/// Where the light comes from, in the world.
-const LIGHT: Vector3<f64> = Vector3::new(0.3, 0.2, 0.93);
 const AMBIENT: f64 = 0.74;
 const DIFFUSE: f64 = 0.3;
 
@@ -263,7 +261,7 @@ impl Rasteriser {
                 return Err(RenderError::Pose { instance: index });
             }
             let camera_from_mesh = camera_from_world * pose;
-            let light = pose.rotation.inverse() * LIGHT;
+            let light = pose.rotation.inverse() * scene.light;
             self.draw(
                 mesh,
                 &camera_from_mesh,

@@ -1,7 +1,10 @@
 //! What there is to see.
 
 use super::Mesh;
-use nalgebra::Isometry3;
+use nalgebra::{Isometry3, Vector3};
+
+/// Where the light usually comes from, in the world.
+pub const LIGHT: Vector3<f64> = Vector3::new(0.3, 0.2, 0.93);
 
 /// A mesh of a [`Scene`].
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
@@ -26,6 +29,8 @@ pub struct Scene {
     pub instances: Vec<Instance>,
     /// Colour where nothing is hit.
     pub background_rgb: [u8; 3],
+    /// Direction to the light, in the world.
+    pub light: Vector3<f64>,
 }
 
 impl Scene {
@@ -35,6 +40,7 @@ impl Scene {
             meshes: Vec::new(),
             instances: Vec::new(),
             background_rgb,
+            light: LIGHT,
         }
     }
 

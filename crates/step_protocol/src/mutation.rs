@@ -23,8 +23,8 @@ pub(crate) enum Mutation {
     ResultCountsTwice,
     /// The planner forgets an approval when a second one is refused.
     RefusalReopensMoving,
-    /// The operator forgets a motion when another proposal comes before its reward.
-    OperatorForgetsMotion,
+    /// In silence the operator asks about proposals only, not about the last motion.
+    SilenceForgetsMotion,
     /// A refused proposal is never made anew.
     RefusedIsNotRenewed,
 }
@@ -43,7 +43,7 @@ impl Mutation {
         Self::AdvanceWithoutMotion,
         Self::ResultCountsTwice,
         Self::RefusalReopensMoving,
-        Self::OperatorForgetsMotion,
+        Self::SilenceForgetsMotion,
         Self::RefusedIsNotRenewed,
     ];
 }

@@ -1,7 +1,6 @@
 //! The operator's side: which question is due.
 
-use std::collections::VecDeque;
-use std::time::Duration;
+use std::collections::{BTreeSet, VecDeque};
 
 use crate::mutation::{Mutation, planted};
 use crate::{
@@ -63,13 +62,16 @@ struct Motion {
 pub struct Operator {
     /// Whether something measures rewards: a question about a motion then waits for its reward.
     has_rewards: bool,
-    step_count: u32,
-    /// Stamp of the present goal: the goal tracker knows of the motions that ended by then.
-    goal_stamp: Option<Duration>,
+    /// The goal tracker knows of the motions that ended by its stamp.
+    goal: Option<Goal>,
     /// The newest is the last.
     proposals: VecDeque<Proposal>,
+    /// Of these, those whose last approval was refused.
+    refused: BTreeSet<ProposalId>,
     /// Waits for its reward.
     motion: Option<Motion>,
+    /// The last motion that a stop or a fault broke off: nothing measures it, and it is asked about on silence only.
+    broken_off: Option<Motion>,
     /// The last question about a motion.
     confirm: Option<Question>,
     /// Whether the newest proposal was asked about.
@@ -82,10 +84,11 @@ impl Operator {
     pub fn new(has_rewards: bool) -> Self {
         Self {
             has_rewards,
-            step_count: 0,
-            goal_stamp: None,
+            goal: None,
             proposals: VecDeque::new(),
+            refused: BTreeSet::new(),
             motion: None,
+            broken_off: None,
             confirm: None,
             asked: false,
             reward: None,
@@ -94,10 +97,10 @@ impl Operator {
 
     /// A goal was published: after a motion that has ended by its stamp nothing is to be confirmed any more.
     pub fn on_goal(&mut self, goal: &Goal) {
-        self.step_count = goal.step_count;
-        self.goal_stamp = Some(goal.stamp);
+        self.goal = Some(goal.clone());
         let is_confirmed = |motion: &mut Motion| motion.result.stamp <= goal.stamp;
         self.motion.take_if(is_confirmed);
+        self.broken_off.take_if(is_confirmed);
     }
 
     /// A new proposal supersedes the one before. While a motion for the same goal waits for its confirmation nothing more is
@@ -109,15 +112,13 @@ impl Operator {
         }
         self.proposals.retain(|known| known.id != id);
         if self.proposals.len() == PROPOSALS {
-            self.proposals.pop_front();
+            let oldest = self.proposals.pop_front();
+            oldest.map(|oldest| self.refused.remove(&oldest.id));
         }
         let of_same_goal = |motion: &Motion| {
             let goal = |proposal: &Proposal| (proposal.step, proposal.attempt);
             goal(&motion.proposal) == goal(&proposal) && motion.proposal.problem == proposal.problem
         };
-        if planted(Mutation::OperatorForgetsMotion) {
-            self.motion = None;
-        }
         self.asked = !self.motion.as_ref().is_some_and(of_same_goal);
         let question = self.asked.then(|| Question::Approve(proposal.clone()));
         self.proposals.push_back(proposal);
@@ -132,15 +133,25 @@ impl Operator {
         let is_known = |question: &Question| question.proposal_id() == id;
         let mut proposals = self.proposals.iter().rev();
         let proposal = proposals.find(|proposal| proposal.id == id)?;
-        if is_at_home
-            && result.was_carried_out()
-            && self.goal_stamp.is_none_or(|stamp| stamp < result.stamp)
+        if refused {
+            self.refused.insert(id);
+        }
+        if result.was_carried_out()
+            && self
+                .goal
+                .as_ref()
+                .is_none_or(|goal| goal.stamp < result.stamp)
             && !self.confirm.as_ref().is_some_and(is_known)
         {
-            self.motion = Some(Motion {
+            let ended = Motion {
                 proposal: proposal.clone(),
                 result,
-            });
+            };
+            if is_at_home {
+                self.motion = Some(ended);
+            } else {
+                self.broken_off = Some(ended);
+            }
         }
         self.confirm()
     }
@@ -158,26 +169,47 @@ impl Operator {
         if self.has_rewards && reward.is_none() {
             return None;
         }
-        self.ask_about_motion(reward)
+        let motion = self.motion.take()?;
+        Some(self.question(motion, reward))
     }
 
-    fn ask_about_motion(&mut self, reward: Option<Reward>) -> Option<Question> {
-        let Motion { proposal, result } = self.motion.take()?;
+    fn question(&mut self, motion: Motion, reward: Option<Reward>) -> Question {
+        let Motion { proposal, result } = motion;
         let question = Question::Confirm {
             result,
             reward,
-            is_last_goal: proposal.step == self.step_count,
+            is_last_goal: self.goal.as_ref().map_or(0, |goal| goal.step_count) == proposal.step,
         };
         self.confirm = Some(question.clone());
-        Some(question)
+        question
     }
 
     /// Nothing has happened for a long time: a message may have been lost, or a node was started again. Repeats what the
     /// operator was asked last. All decisions are safe to repeat: the executor and the goal tracker count each once.
     pub fn on_silence(&mut self) -> Vec<Question> {
-        let about_motion = self.ask_about_motion(None).or_else(|| self.confirm.clone());
+        let motion = self.motion.take().or_else(|| self.broken_off.take());
+        let about_motion = match motion {
+            _ if planted(Mutation::SilenceForgetsMotion) => None,
+            Some(motion) => Some(self.question(motion, None)),
+            None => self.confirm.clone(),
+        };
         self.asked = true;
-        let newest = self.proposals.back().cloned().map(Question::Approve);
-        about_motion.into_iter().chain(newest).collect()
+        let of_goal = |proposal: &&Proposal| {
+            self.goal.as_ref().is_some_and(|goal| {
+                (proposal.step, proposal.attempt) == (goal.step, goal.attempt)
+                    && proposal.problem == goal.problem
+            })
+        };
+        let is_refused = |proposal: &&Proposal| self.refused.contains(&proposal.id);
+        // Not one that cannot be approved or is for another goal: whoever proposes for this goal has to hear whether the approval
+        // was lost.
+        let of_goal = || self.proposals.iter().rev().filter(of_goal);
+        let newest = of_goal().find(|proposal| !is_refused(proposal));
+        let newest = newest.or_else(|| of_goal().next());
+        let newest = newest.or(self.proposals.back()).cloned();
+        about_motion
+            .into_iter()
+            .chain(newest.map(Question::Approve))
+            .collect()
     }
 }

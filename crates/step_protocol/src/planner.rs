@@ -253,6 +253,12 @@ impl ProposalPlanner {
 
     /// The approval of the present proposal was refused.
     fn on_refusal(&mut self, status: Option<ProposalStatus>) {
+        // The executor has forgotten the motion, as it was started again, and may be the only one that could tell of it.
+        if matches!(self.progress, Progress::Closed) && status == Some(ProposalStatus::Pending) {
+            self.revision += 1;
+            self.progress = Progress::Waiting;
+            return;
+        }
         let (Progress::Proposed(pending) | Progress::Approved(pending)) = &mut self.progress else {
             return;
         };

@@ -316,9 +316,11 @@ impl GoalTracker {
 
     /// Publishes a goal at a call, not because of a motion.
     fn restart_at(&mut self, index: usize) -> Change {
-        self.stopped = false;
+        let was_stopped = std::mem::take(&mut self.stopped);
         let stamp = self.stamp.max(self.moved_until);
-        let before = self.attempts.get(&index).filter(|_| stamp == self.stamp);
+        // While the run was stopped proposals were made from what was seen after the motion; they must not be taken for new ones.
+        let before = self.attempts.get(&index);
+        let before = before.filter(|_| stamp == self.stamp || was_stopped);
         let attempt = before.map_or(0, |attempt| attempt + 1);
         self.next_goal(index, attempt, stamp)
     }

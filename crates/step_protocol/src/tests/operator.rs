@@ -248,3 +248,37 @@ fn in_silence_the_last_questions_are_asked_again_without_the_reward_if_need_be()
     assert_eq!(again[0].automatic_answer(), OperatorDecision::Retry);
     assert_eq!(operator.on_silence(), again);
 }
+
+#[test]
+fn a_motion_that_was_broken_off_is_asked_about_in_silence() {
+    let mut operator = Operator::new(true);
+    operator.on_goal(&goal(3, 0));
+    operator.on_proposal(proposal(7, 10));
+    let stopped = StepResult {
+        status: Some(ProposalStatus::Done),
+        ..result(7, StepOutcome::Stopped)
+    };
+    assert_eq!(operator.on_result(stopped), None);
+    let again = operator.on_silence();
+    assert_eq!(answer(again.first().cloned()), (7, OperatorDecision::Retry));
+}
+
+#[test]
+fn in_silence_a_proposal_that_was_refused_or_is_for_another_goal_gives_way_to_one_for_the_goal() {
+    let mut operator = Operator::new(true);
+    operator.on_goal(&goal(3, 0));
+    operator.on_proposal(proposal(7, 10));
+    operator.on_proposal(proposal(8, 10));
+    operator.on_proposal(Proposal {
+        step: 2,
+        ..proposal(9, 10)
+    });
+    let asked = operator.on_silence();
+    assert_eq!(answer(asked.last().cloned()).0, 8);
+    operator.on_result(StepResult {
+        status: Some(ProposalStatus::Pending),
+        ..result(8, StepOutcome::Refused)
+    });
+    let asked = operator.on_silence();
+    assert_eq!(answer(asked.last().cloned()).0, 7);
+}

@@ -411,3 +411,13 @@ fn a_job_holds_the_image_to_be_reached_and_the_one_before_it() {
     assert_eq!(job.goal, goal(3, 0, 0).image);
     assert_eq!(job.previous, goal(3, 0, 0).previous);
 }
+
+#[test]
+fn a_motion_that_the_executor_has_forgotten_is_proposed_anew() {
+    let (mut planner, proposal) = proposed();
+    planner.on_result(&result(proposal.id, StepOutcome::LagAborted));
+    assert_eq!(planner.on_heightmap(heightmap(20, 0.0)), None);
+    // The executor was started again: to it the proposal is one that nobody has approved.
+    let job = planner.on_result(&refused(proposal.id, ProposalStatus::Pending));
+    assert!(job.is_some());
+}

@@ -29,14 +29,21 @@ pub fn command(program: impl AsRef<OsStr>) -> Command {
 
 /// Cargo, with the environment a person's shell would give it.
 ///
-/// `cargo xtask` hands its `[env]` table on to this process. Left in place, build scripts would see LIBTORCH
-/// change between `cargo xtask test` and a plain `cargo test`, and compile torch-sys again each time.
+/// `cargo xtask` hands its `[env]` table and what it says of the package `xtask` on to this process. Left in place, build
+/// scripts would see LIBTORCH, CARGO_PKG_NAME and others change between `cargo xtask test` and a plain `cargo test`, and compile
+/// torch-sys, ring and what uses them again each time.
 pub fn cargo() -> Command {
     let mut command = command(std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into()));
     if std::env::var_os("LIBTORCH")
         .is_some_and(|dir| Path::new(&dir) == repository_root().join(".libtorch"))
     {
         command.env_remove("LIBTORCH");
+    }
+    for (name, _) in std::env::vars_os() {
+        let text = name.to_string_lossy();
+        if text.starts_with("CARGO_PKG_") || text.starts_with("CARGO_MANIFEST_") {
+            command.env_remove(&name);
+        }
     }
     command
 }

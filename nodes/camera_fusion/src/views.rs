@@ -899,10 +899,12 @@ mod tests {
         let mut fuse = |stamp_ms: u64, height_m: f32| {
             let stamp = Duration::from_millis(stamp_ms);
             for (camera, frame) in ["front", "left"].into_iter().enumerate() {
-                views
-                    .image(camera, Stream::Color, color(stamp, frame))
-                    .unwrap();
-                let depth = depth(stamp, frame, height_m);
+                let header = || header(stamp, frame);
+                let rgb = vec![100; 3 * dense.len()];
+                let color = convert::color_to_msg(header(), &dense, rgb).unwrap();
+                views.image(camera, Stream::Color, color).unwrap();
+                let depth_m = vec![1.0 - height_m; dense.len()];
+                let depth = convert::depth_to_msg(header(), &dense, &depth_m).unwrap();
                 views.image(camera, Stream::Depth, depth).unwrap();
             }
             let (fused, complaints) = views.fuse();

@@ -291,6 +291,7 @@ impl ConsoleNode {
                     ..
                 } = &confirmation;
                 info!("`{operator_name}`: decision {decision} on proposal {proposal_id}");
+                self.publish_presence(node);
                 self.confirmations.publish(confirmation);
             }
             Command::Propose(proposal) => {
@@ -299,8 +300,11 @@ impl ConsoleNode {
             }
             Command::Home(name) => {
                 info!("`{name}`: home");
+                self.publish_presence(node);
                 let (client, console) = (Arc::clone(&self.home), Arc::clone(&self.console));
                 node.spawn(async move {
+                    // The executor has to hear that the operator is present before the call, also where they have just taken control.
+                    tokio::time::sleep(PRESENCE_PERIOD).await;
                     let answer = client.call(&TriggerRequest::default(), &HOME_TIMEOUT).await;
                     let (kind, reason) = match answer {
                         Ok(answer) if answer.success => ("note", "The arm is at home.".to_owned()),

@@ -1,6 +1,6 @@
 //! Node that serves the operator's page: see, approve and stop a run in a browser.
 //!
-//! [`Run`](run::Run) is what the operator sees, [`Sessions`](session::Sessions) who watches and who decides; neither knows ROS
+//! `run::Run` is what the operator sees, `session::Sessions` who watches and who decides; neither knows ROS
 //! node, clock or network.
 
 mod console;

@@ -31,23 +31,23 @@ pub struct Perturbation {
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Depth {
-    /// Standard deviation of the disparity [px]; 0 for none.
+    /// Standard deviation of the disparity (px); 0 for none.
     pub disparity_noise_px: f64,
-    /// Focal length of the stereo pair [px].
+    /// Focal length of the stereo pair (px).
     pub focal_px: f64,
-    /// Baseline of the stereo pair [m].
+    /// Baseline of the stereo pair (m).
     pub baseline_m: f64,
     /// Size of the patches that are wrong alike [px of the image].
     pub patch_px: f64,
     /// Share of the variance that is the same in all frames of a session.
     pub constant_share: f64,
-    /// Smallest step of the disparity [px]; 0 for none.
+    /// Smallest step of the disparity (px); 0 for none.
     pub disparity_step_px: f64,
-    /// Smallest step of the depth [m]; 0 for none.
+    /// Smallest step of the depth (m); 0 for none.
     pub unit_m: f64,
-    /// Nearer than this nothing is measured [m].
+    /// Nearer than this nothing is measured (m).
     pub min_m: f64,
-    /// Farther than this nothing is measured [m].
+    /// Farther than this nothing is measured (m).
     pub max_m: f64,
 }
 
@@ -55,9 +55,9 @@ pub struct Depth {
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Edges {
-    /// A difference of neighbours from which on it is an edge [m].
+    /// A difference of neighbours from which on it is an edge (m).
     pub step_m: f64,
-    /// How far from the edge pixels are affected [px].
+    /// How far from the edge pixels are affected (px).
     pub width_px: usize,
     /// Share of these pixels that lie somewhere between the near and the far side: flying pixels.
     pub flying_share: f64,
@@ -71,7 +71,7 @@ pub struct Edges {
 pub struct Holes {
     /// Share of the image without depth.
     pub share: f64,
-    /// Edge length of a patch [px].
+    /// Edge length of a patch (px).
     pub size_px: usize,
 }
 
@@ -91,7 +91,7 @@ pub struct Color {
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Light {
-    /// Greatest angle between the light and where it usually comes from [rad].
+    /// Greatest angle between the light and where it usually comes from (rad).
     pub turn_rad: f64,
 }
 
@@ -99,9 +99,9 @@ pub struct Light {
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(deny_unknown_fields)]
 pub struct Extrinsics {
-    /// Standard deviation of the position along each axis [m].
+    /// Standard deviation of the position along each axis (m).
     pub shift_m: f64,
-    /// Standard deviation of the rotation about each axis [rad].
+    /// Standard deviation of the rotation about each axis (rad).
     pub turn_rad: f64,
 }
 
@@ -111,9 +111,9 @@ pub struct Extrinsics {
 pub struct Clutter {
     /// Greatest number of boxes.
     pub max_count: usize,
-    /// Shortest edge [m].
+    /// Shortest edge (m).
     pub min_size_m: f64,
-    /// Longest edge [m].
+    /// Longest edge (m).
     pub max_size_m: f64,
 }
 

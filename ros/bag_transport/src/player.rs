@@ -44,7 +44,7 @@ pub struct PlayerOptions {
     pub duration: Option<Duration>,
     /// Begin again at the end.
     pub repeat: bool,
-    /// Publish `/clock` at this rate [Hz] in place of the recorded one.
+    /// Publish `/clock` at this rate (Hz) in place of the recorded one.
     pub clock_hz: Option<f64>,
     /// Begin paused.
     pub paused: bool,

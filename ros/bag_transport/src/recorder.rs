@@ -292,7 +292,7 @@ impl Recorder {
         }
     }
 
-    /// Stamp of the last message on a topic whose type begins with a stamp or a header, if one has come [ns].
+    /// Stamp of the last message on a topic whose type begins with a stamp or a header, if one has come (ns).
     pub fn last_stamp_ns(&self, topic: &str) -> Option<i64> {
         let name = self.node.resolve(topic);
         let heard = self.shared.heard();

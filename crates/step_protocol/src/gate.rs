@@ -538,7 +538,19 @@ impl ApprovalGate {
             id,
             outcome,
             reason,
-            status: self.status(id),
+            status: self.final_status(id),
+        })
+    }
+
+    /// Where a proposal stands for others: one whose id stands for two contents cannot be approved any more.
+    pub fn final_status(&self, id: ProposalId) -> Option<ProposalStatus> {
+        let status = self.status(id)?;
+        let newest = self.newest.as_ref();
+        let is_invalid =
+            newest.is_some_and(|newest| newest.proposal.id == id && newest.invalid.is_some());
+        Some(match status {
+            ProposalStatus::Pending if is_invalid => ProposalStatus::Superseded,
+            status => status,
         })
     }
 

@@ -1,11 +1,11 @@
 //! The operator's side: which question is due.
 
 use std::collections::VecDeque;
+use std::time::Duration;
 
 use crate::mutation::{Mutation, planted};
 use crate::{
-    Judgement, OperatorDecision, Proposal, ProposalId, ProposalStatus, Reward, StepOutcome,
-    StepResult,
+    Goal, Judgement, OperatorDecision, Proposal, ProposalId, Reward, StepOutcome, StepResult,
 };
 
 /// Proposals whose result may still come.
@@ -64,6 +64,8 @@ pub struct Operator {
     /// Whether something measures rewards: a question about a motion then waits for its reward.
     has_rewards: bool,
     step_count: u32,
+    /// Stamp of the present goal: the goal tracker knows of the motions that ended by then.
+    goal_stamp: Option<Duration>,
     /// The newest is the last.
     proposals: VecDeque<Proposal>,
     /// Waits for its reward.
@@ -81,6 +83,7 @@ impl Operator {
         Self {
             has_rewards,
             step_count: 0,
+            goal_stamp: None,
             proposals: VecDeque::new(),
             motion: None,
             confirm: None,
@@ -89,9 +92,12 @@ impl Operator {
         }
     }
 
-    /// A goal was published: how many there are.
-    pub fn on_goal(&mut self, step_count: u32) {
-        self.step_count = step_count;
+    /// A goal was published: after a motion that has ended by its stamp nothing is to be confirmed any more.
+    pub fn on_goal(&mut self, goal: &Goal) {
+        self.step_count = goal.step_count;
+        self.goal_stamp = Some(goal.stamp);
+        let is_confirmed = |motion: &mut Motion| motion.result.stamp <= goal.stamp;
+        self.motion.take_if(is_confirmed);
     }
 
     /// A new proposal supersedes the one before. While a motion for the same goal waits for its confirmation nothing more is
@@ -109,9 +115,10 @@ impl Operator {
             let goal = |proposal: &Proposal| (proposal.step, proposal.attempt);
             goal(&motion.proposal) == goal(&proposal) && motion.proposal.problem == proposal.problem
         };
-        self.motion
-            .take_if(|motion| !of_same_goal(motion) || planted(Mutation::OperatorForgetsMotion));
-        self.asked = self.motion.is_none();
+        if planted(Mutation::OperatorForgetsMotion) {
+            self.motion = None;
+        }
+        self.asked = !self.motion.as_ref().is_some_and(of_same_goal);
         let question = self.asked.then(|| Question::Approve(proposal.clone()));
         self.proposals.push_back(proposal);
         question
@@ -120,16 +127,14 @@ impl Operator {
     /// The executor's word on a proposal. The refusal of one that was carried out before says that its result was lost.
     pub fn on_result(&mut self, result: StepResult) -> Option<Question> {
         let id = result.proposal_id;
-        let was_carried_out = result.outcome.motion().is_some()
-            || (result.outcome == StepOutcome::Refused
-                && result.status == Some(ProposalStatus::Done));
+        let refused = result.outcome == StepOutcome::Refused;
+        let is_at_home = refused || result.outcome.motion().is_some();
         let is_known = |question: &Question| question.proposal_id() == id;
-        let newest = self.proposals.back()?;
-        let goal = (newest.step, newest.attempt);
         let mut proposals = self.proposals.iter().rev();
         let proposal = proposals.find(|proposal| proposal.id == id)?;
-        if was_carried_out
-            && goal == (proposal.step, proposal.attempt)
+        if is_at_home
+            && result.was_carried_out()
+            && self.goal_stamp.is_none_or(|stamp| stamp < result.stamp)
             && !self.confirm.as_ref().is_some_and(is_known)
         {
             self.motion = Some(Motion {

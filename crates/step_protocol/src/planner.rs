@@ -67,8 +67,8 @@ enum Progress {
     Proposed(Pending),
     /// The operator has approved; the arm may be moving before the cameras.
     Approved(Pending),
-    /// The arm has moved: the operator decides what is next, and a new goal comes.
-    Moved,
+    /// The arm has moved, or the proposal was withdrawn: the operator decides what is next, and a new goal comes.
+    Closed,
     /// The network could not decide; only another observation or goal can help.
     Failed(Observation),
 }
@@ -220,28 +220,29 @@ impl ProposalPlanner {
         if pending.id == result.proposal_id {
             refused && result.status.is_none()
         } else {
-            matches!(self.progress, Progress::Proposed(_)) && !result.outcome.arm_moved()
+            matches!(self.progress, Progress::Proposed(_)) && !result.arm_moved()
         }
     }
 
     /// The executor has reported: after a motion nothing more is proposed for this goal, after a refusal of the approval the
     /// proposal is pending again.
     pub fn on_result(&mut self, result: &StepResult) -> Option<Job> {
-        let was_carried_out = result.outcome.arm_moved()
-            || (result.outcome == StepOutcome::Refused
-                && result.status == Some(ProposalStatus::Done));
-        if result.outcome.arm_moved() {
+        if result.arm_moved() {
             self.moved_until = result.stamp;
             self.record_motion(result);
         }
         if self.last_proposal_id == Some(result.proposal_id) {
-            if was_carried_out {
+            if result.was_carried_out() {
                 self.moved_until = result.stamp;
                 // The heightmap after the motion may come before its result.
                 self.start_again();
-                self.progress = Progress::Moved;
+                self.progress = Progress::Closed;
             } else if result.outcome == StepOutcome::Refused {
                 self.on_refusal(result.status);
+            } else if result.outcome == StepOutcome::Stopped {
+                // Withdrawn: only another goal lets things go on.
+                self.start_again();
+                self.progress = Progress::Closed;
             } else {
                 // A goal that says so follows.
                 return None;
@@ -365,7 +366,7 @@ impl ProposalPlanner {
                 is_due(seen) || (pending.refused && newest.stamp > seen.stamp)
             }
             Progress::Failed(seen) => is_due(seen),
-            Progress::Predicting(_) | Progress::Approved(_) | Progress::Moved => false,
+            Progress::Predicting(_) | Progress::Approved(_) | Progress::Closed => false,
         };
         if !due {
             return None;

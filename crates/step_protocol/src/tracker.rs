@@ -351,8 +351,14 @@ impl GoalTracker {
             self.remember(proposal.id);
             return;
         }
-        let moved = self.current.is_some_and(|current| current.moved.is_some());
-        if moved || self.seen.contains(&proposal.id) || self.is_current(proposal.id) {
+        if self.seen.contains(&proposal.id) || self.is_current(proposal.id) {
+            return;
+        }
+        if self.has_moved() {
+            // It is of this goal, and counts only if the arm moves for it too.
+            if self.superseded.len() < MAX_SEEN {
+                self.superseded.entry(proposal.id).or_default();
+            }
             return;
         }
         let queued = self.superseded.remove(&proposal.id).flatten();
@@ -382,7 +388,7 @@ impl GoalTracker {
     pub fn on_result(&mut self, result: &StepResult) -> Change {
         let id = result.proposal_id;
         // The stop itself may have arrived before.
-        if result.outcome == StepOutcome::Stopped && self.is_current(id) {
+        if result.outcome == StepOutcome::Stopped && result.arm_moved() && self.is_current(id) {
             self.moved_until = result.stamp;
         }
         if self.stopped || self.is_complete() {
@@ -391,7 +397,9 @@ impl GoalTracker {
         let is_of_this_goal = self.is_current(id) || self.superseded.contains_key(&id);
         match (result.outcome, result.status) {
             // Its result was lost: only the refusal of a second approval says that the arm has moved.
-            (StepOutcome::Refused, Some(ProposalStatus::Done)) if is_of_this_goal => {
+            (StepOutcome::Refused, Some(ProposalStatus::Done))
+                if is_of_this_goal && !self.has_moved() =>
+            {
                 self.on_motion(result)
             }
             // Nothing has moved, so what was seen before still holds: the stamp stays.
@@ -402,7 +410,7 @@ impl GoalTracker {
                 self.next_goal(self.reached, self.attempt + 1, self.stamp)
             }
             (StepOutcome::Stopped, _) if self.judge != StepJudge::Operator => Change::None,
-            (outcome, _) if outcome.arm_moved() => self.on_motion(result),
+            _ if result.arm_moved() => self.on_motion(result),
             _ => Change::None,
         }
     }
@@ -419,11 +427,19 @@ impl GoalTracker {
         if self.current.is_none() && is_new {
             self.make_current(id, None);
         }
-        // The executor has not accepted what came after it.
-        if !self.has_moved()
-            && let Some(queued) = self.superseded.remove(&id)
+        // The executor has not accepted what came after it; or the arm has moved again before anybody decided on the motion
+        // before: then the last motion is the one to decide on, unless a decision on the first one waits for its result.
+        let mut stamp = result.stamp;
+        if let Some(current) = self.current.filter(|current| current.id != id)
+            && is_new
         {
-            self.make_current(id, queued);
+            let queued = self.superseded.get(&id).copied();
+            let is_newer = current.moved < Some(stamp) && (queued.is_some() || self.has_moved());
+            if is_newer || queued.flatten().is_some() {
+                stamp = current.moved.map_or(stamp, |moved| moved.max(stamp));
+                self.superseded.remove(&id);
+                self.make_current(id, queued.flatten());
+            }
         }
         let Some(current) = &mut self.current else {
             return Change::None;
@@ -431,8 +447,8 @@ impl GoalTracker {
         if current.id != id || current.moved.is_some() {
             return Change::None;
         }
-        current.moved = Some(result.stamp);
-        self.moved_until = result.stamp;
+        current.moved = Some(stamp);
+        self.moved_until = stamp;
         let judgement = match (self.judge, result.outcome) {
             (StepJudge::Operator, _) => current.queued.take(),
             (StepJudge::Outcome, StepOutcome::Placed) => Some(Judgement::Advance),
@@ -440,7 +456,7 @@ impl GoalTracker {
             (StepJudge::Image, _) => None,
         };
         match judgement {
-            Some(judgement) => self.after_motion(judgement, result.stamp),
+            Some(judgement) => self.after_motion(judgement, stamp),
             None => Change::None,
         }
     }

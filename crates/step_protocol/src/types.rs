@@ -72,6 +72,12 @@ impl StepOutcome {
         !matches!(self, Self::Refused | Self::Rejected)
     }
 
+    /// [`Self::arm_moved`] where it is known where the proposal stands: a stop that only withdrew it moved nothing.
+    pub fn arm_moved_for(self, status: Option<ProposalStatus>) -> bool {
+        let withdrawn = status == Some(ProposalStatus::Withdrawn);
+        self.arm_moved() && !(self == Self::Stopped && withdrawn)
+    }
+
     /// How the primitive ended, if it ran to its end, the arm being back home.
     pub const fn motion(self) -> Option<Outcome> {
         match self {
@@ -317,6 +323,20 @@ pub struct StepResult {
     pub duration: Duration,
     /// Where the proposal stands after this word; none if the executor does not know it.
     pub status: Option<ProposalStatus>,
+}
+
+impl StepResult {
+    /// Whether the arm may have moved for this proposal.
+    pub fn arm_moved(&self) -> bool {
+        self.outcome.arm_moved_for(self.status)
+    }
+
+    /// Whether the proposal was carried out, to whatever end: the executor reports the motion, or it refuses to carry the
+    /// proposal out once more, which stands for a result that was lost.
+    pub fn was_carried_out(&self) -> bool {
+        let done = self.status == Some(ProposalStatus::Done);
+        self.arm_moved() || (self.outcome == StepOutcome::Refused && done)
+    }
 }
 
 /// An operator's word on one proposal.

@@ -387,6 +387,11 @@ fn an_id_that_stands_for_two_contents_moves_nothing() {
     assert!(invalid(&mut gate, other).contains("different contents"));
     let actions = approve(&mut gate, 7);
     assert_refused(&gate, actions, &["7", "different contents"]);
+    // Its author has to make another one.
+    assert_eq!(
+        gate.final_status(ProposalId(7)),
+        Some(ProposalStatus::Superseded)
+    );
 }
 
 #[test]

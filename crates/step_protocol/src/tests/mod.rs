@@ -1,4 +1,5 @@
 mod gate;
 mod operator;
 mod planner;
+mod schedules;
 mod tracker;

@@ -1,12 +1,14 @@
 //! What the operator is asked.
 
+use std::sync::Arc;
 use std::time::Duration;
 
+use heightmap::{Heightmap, Workspace};
 use nalgebra::Isometry2;
 use pick_place::{PickPlace, PrimitiveSettings};
 
 use crate::{
-    Operator, OperatorDecision, Proposal, ProposalId, ProposalStatus, Question, Reward,
+    Goal, Operator, OperatorDecision, Proposal, ProposalId, ProposalStatus, Question, Reward,
     StepOutcome, StepResult,
 };
 
@@ -29,6 +31,22 @@ fn proposal(id: u64, stamp_s: u64) -> Proposal {
         success_probability: None,
         checkpoint: String::new(),
         author: "test".into(),
+    }
+}
+
+fn goal(step_count: u32, stamp_s: u64) -> Goal {
+    Goal {
+        stamp: Duration::from_secs(stamp_s),
+        problem: "placing".into(),
+        demonstration: "placing/1".into(),
+        step: 1,
+        step_count,
+        attempt: 0,
+        complete: false,
+        module: "placing".into(),
+        settings: PrimitiveSettings::RIGID,
+        image: Arc::new(Heightmap::new(Workspace::RAVENS)),
+        previous: None,
     }
 }
 
@@ -66,7 +84,7 @@ fn answer(question: Option<Question>) -> (u64, OperatorDecision) {
 fn a_step_is_confirmed_whichever_of_result_and_reward_comes_first() {
     for reward_first in [false, true] {
         let mut operator = Operator::new(true);
-        operator.on_goal(3);
+        operator.on_goal(&goal(3, 0));
         let asked = operator.on_proposal(proposal(7, 10));
         assert_eq!(answer(asked), (7, OperatorDecision::Approve));
         // The reward of the start says nothing about the step.
@@ -101,7 +119,7 @@ fn without_a_reward_a_step_is_tried_again_after_a_loss_the_goal_before_comes() {
 #[test]
 fn the_last_goal_stays_until_everything_is_complete() {
     let mut operator = Operator::new(true);
-    operator.on_goal(1);
+    operator.on_goal(&goal(1, 0));
     operator.on_proposal(proposal(7, 10));
     operator.on_result(placed(7));
     let question = operator.on_reward(reward(0.1, 20));
@@ -174,20 +192,33 @@ fn a_result_that_comes_after_the_next_proposal_is_confirmed() {
 }
 
 #[test]
-fn a_proposal_for_the_next_goal_ends_the_wait_for_a_reward() {
+fn a_goal_from_after_the_motion_ends_the_wait_for_a_reward() {
     let mut operator = Operator::new(true);
+    operator.on_goal(&goal(3, 10));
     operator.on_proposal(proposal(7, 10));
     operator.on_result(placed(7));
     // Another operator has confirmed.
-    let next = Proposal {
-        step: 2,
-        ..proposal(8, 15)
-    };
+    operator.on_goal(&goal(3, 20));
     assert_eq!(
-        answer(operator.on_proposal(next)),
+        answer(operator.on_proposal(proposal(8, 20))),
         (8, OperatorDecision::Approve)
     );
     assert_eq!(operator.on_reward(reward(0.1, 20)), None);
+    assert_eq!(operator.on_result(placed(7)), None);
+}
+
+#[test]
+fn somebodys_proposal_for_another_goal_takes_no_confirmation_away() {
+    let mut operator = Operator::new(true);
+    operator.on_proposal(proposal(7, 10));
+    let other = Proposal {
+        step: 2,
+        ..proposal(8, 10)
+    };
+    operator.on_proposal(other);
+    operator.on_result(placed(7));
+    let question = operator.on_reward(reward(0.1, 20));
+    assert_eq!(answer(question), (7, OperatorDecision::Advance));
 }
 
 #[test]

@@ -665,3 +665,35 @@ fn every_goal_comes_with_the_image_before_it() {
     assert_eq!(heights(tracker.goal().unwrap()), (0.1, 0.2));
     assert_eq!(tracker.known_images().unwrap().count(), 3);
 }
+
+#[test]
+fn a_stop_that_moved_nothing_asks_for_no_newer_heightmap_and_no_attempt_comes_again() {
+    let mut tracker = tracker(1);
+    tracker.on_proposal(&proposal(7, 1, 0));
+    tracker
+        .on_confirmation(&says(OperatorDecision::Stop, 7))
+        .unwrap();
+    tracker.on_result(&StepResult {
+        status: Some(ProposalStatus::Withdrawn),
+        ..result(7, StepOutcome::Stopped, 5)
+    });
+    // From the same heightmap attempt 0 would give the proposal that was withdrawn.
+    assert_eq!(goal(tracker.set_step(1).unwrap()), (1, 1, 0, false));
+}
+
+#[test]
+fn a_second_motion_for_the_same_goal_is_the_one_to_decide_on() {
+    let mut tracker = tracker(2);
+    tracker.on_proposal(&proposal(7, 1, 0));
+    tracker.on_result(&result(7, StepOutcome::Placed, 5));
+    // Nobody knows of the first one any more: the operators were started again.
+    tracker.on_proposal(&proposal(8, 1, 0));
+    tracker.on_result(&result(8, StepOutcome::Placed, 9));
+    assert!(
+        tracker
+            .on_confirmation(&says(OperatorDecision::Advance, 7))
+            .is_err()
+    );
+    let change = tracker.on_confirmation(&says(OperatorDecision::Advance, 8));
+    assert_eq!(goal(change.unwrap()), (2, 0, 9, false));
+}

@@ -340,6 +340,17 @@ impl Cell {
         }
     }
 
+    /// One physics step in which the arm stands still; whether the bodies are settled stays as it was known.
+    ///
+    /// # Errors
+    /// While a motion is under way.
+    pub fn pass_time(&mut self) -> Result<(), CellError> {
+        if self.motion.is_some() {
+            return Err(CellError::Busy);
+        }
+        self.step()
+    }
+
     /// Carries out an action on a copy of arm and bodies, which goes on as the cell would bit for bit.
     pub fn rehearse(
         &self,

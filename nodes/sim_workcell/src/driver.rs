@@ -4,7 +4,7 @@ use msgs::control_msgs::{FollowJointTrajectoryGoal, FollowJointTrajectoryResult,
 use msgs::convert::{ConvertError, joint_trajectory_from_msg};
 use msgs::trajectory_msgs;
 use msgs::ur_msgs::FollowJointTrajectoryUntilGoal;
-use ur5::{Arm, JointTrajectory};
+use ur5::{Arm, JointTrajectory, Joints};
 
 /// Why a goal fails: an error code of `FollowJointTrajectory`, and the reason for people.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
@@ -27,6 +27,22 @@ impl Failure {
     fn goal(reason: impl Into<String>) -> Self {
         Self::new(FollowJointTrajectoryResult::INVALID_GOAL, reason)
     }
+}
+
+/// What the tolerances of a goal mean: 0 keeps the controller's, a negative one allows everything (rad).
+pub(crate) fn path_tolerances(
+    tolerances: &[JointTolerance],
+    joint_names: &[String; 6],
+    default_rad: f64,
+) -> Joints {
+    let mut all = Joints::repeat(default_rad);
+    for (index, name) in joint_names.iter().enumerate() {
+        let asked = tolerances.iter().find(|tolerance| tolerance.name == *name);
+        if let Some(tolerance) = asked.filter(|tolerance| tolerance.position != 0.0) {
+            all[index] = tolerance.position;
+        }
+    }
+    all
 }
 
 /// The trajectory of a goal of `FollowJointTrajectory`.
@@ -100,8 +116,7 @@ fn trajectory(
     Ok(trajectory)
 }
 
-/// The simulated arm follows exactly, so that tolerances are met whatever they are; but they must
-/// make sense.
+/// Tolerances must make sense, whether or not the arm follows exactly.
 fn check_tolerances(
     field: &str,
     tolerances: &[JointTolerance],
@@ -220,6 +235,25 @@ pub(crate) mod tests {
             assert_eq!(failure.code, code);
             assert!(failure.reason.contains("path_tolerance[1]"), "{failure}");
         }
+    }
+
+    #[test]
+    fn a_tolerance_of_zero_is_the_controllers_and_a_negative_one_allows_everything() {
+        let names = ["a", "b", "c", "d", "e", "f"].map(String::from);
+        let tolerance = |name: &str, position| JointTolerance {
+            name: name.into(),
+            position,
+            ..Default::default()
+        };
+        let asked = [
+            tolerance("c", 0.05),
+            tolerance("a", -1.0),
+            tolerance("f", 0.0),
+        ];
+        assert_eq!(
+            path_tolerances(&asked, &names, 0.2),
+            Joints::new(-1.0, 0.2, 0.05, 0.2, 0.2, 0.2)
+        );
     }
 
     #[test]

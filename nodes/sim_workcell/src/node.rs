@@ -3,15 +3,20 @@
 use std::path::Path;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::mpsc;
+use std::sync::{Mutex, MutexGuard, PoisonError, mpsc};
 use std::thread;
-use std::time::{Duration, Instant};
+use std::time::{Duration, Instant, SystemTime};
 
 use anyhow::Context as _;
 use camera_noise::{Perturbation, Rig};
+use driver_model::{AcceptanceQueue, Answer, Controllers, EncoderNoise, Fault, HardwareSettings};
 use heightmap::Camera;
 use msgs::control_msgs::{
     FollowJointTrajectory, FollowJointTrajectoryFeedback, FollowJointTrajectoryResult,
+};
+use msgs::controller_manager_msgs::{
+    ControllerState, ListControllers, ListControllersResponse, SwitchController,
+    SwitchControllerResponse,
 };
 use msgs::convert::{self, ConvertError};
 use msgs::rosgraph_msgs::Clock;
@@ -23,20 +28,27 @@ use msgs::trajectory_msgs::JointTrajectoryPoint;
 use msgs::ur_dashboard_msgs::{RobotMode, SafetyMode};
 use msgs::ur_msgs::{
     FollowJointTrajectoryUntil, FollowJointTrajectoryUntilFeedback,
-    FollowJointTrajectoryUntilResult, IOStates, SetIO, SetIORequest, SetIOResponse,
+    FollowJointTrajectoryUntilResult, GetRobotSoftwareVersion, GetRobotSoftwareVersionResponse,
+    IOStates, SetIO, SetIORequest, SetIOResponse, ToolDataMsg,
 };
 use multiravens::render::RgbdImage;
 use multiravens::{MotionEnd, Problem};
 use node_kit::{Active, Level, NewGoal, Node, Once, Publisher, Qos, RunningGoal};
 use tokio::sync::oneshot;
 use tracing::{error, info, warn};
-use ur5::{JointTrajectory, WorkCell};
+use ur5::{JointTrajectory, Joints, WorkCell};
 
-use crate::driver::{Failure, follow_trajectory, until_trajectory};
+use crate::driver::{Failure, follow_trajectory, path_tolerances, until_trajectory};
 use crate::frames::{CameraTopics, Frame, camera_transforms, link_transforms};
 use crate::parameters::SimWorkcellParameters;
 use crate::workcell::{Step, Wiring, Workcell};
 
+/// Detects contact; only robots with software 5 or later have it.
+const TOOL_CONTACT: &str = "tool_contact_controller";
+/// How often a dead driver looks whether it was started again.
+const DEAD_PERIOD: Duration = Duration::from_millis(20);
+/// The most that simulated time catches up at once.
+const MOST_CATCH_UP: Duration = Duration::from_millis(200);
 /// Commands that wait for the hardware's thread; more are refused.
 const WAITING_COMMANDS: usize = 64;
 /// Simulated time between feedback messages, as the driver's controllers have it.
@@ -69,34 +81,74 @@ pub async fn configure(
         path => Some(Perturbation::load(path).context("parameter perturbation")?),
     };
     let seed = parameters.seed;
-    let workcell = tokio::task::spawn_blocking({
-        let work_cell = work_cell.clone();
-        move || Workcell::new(&problem, &work_cell, seed, wiring, perturbation)
+    let behaviour = parameters.hardware.clone();
+    let mut workcell = tokio::task::spawn_blocking({
+        let (work_cell, behaviour) = (work_cell.clone(), behaviour.clone());
+        move || Workcell::new(&problem, &work_cell, seed, wiring, perturbation, behaviour)
     })
     .await
     .context("setting up the episode")??;
+    if behaviour.free_running {
+        let now = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH);
+        workcell.begin_at(now.context("the clock is before 1970")?);
+    }
+    let controller = controller_of(&parameters.follow_action);
+    let shared = Arc::new(Shared {
+        stop: AtomicBool::new(false),
+        dead: AtomicBool::new(false),
+        controllers: Mutex::new(Controllers::new(
+            controller,
+            &behaviour.inactive_controllers,
+            behaviour.software_major,
+        )),
+    });
 
     let (follow_action, until_action) = (
         parameters.follow_action.clone(),
         parameters.until_action.clone(),
     );
     let (sender, commands) = mpsc::sync_channel(WAITING_COMMANDS);
-    let stop = Arc::new(AtomicBool::new(false));
     let hardware = Hardware::new(
         &node,
         parameters,
         workcell,
         work_cell,
         commands,
-        Arc::clone(&stop),
+        Arc::clone(&shared),
     )?;
     Ok(HardwareNode {
         hardware: Some(hardware),
         sender,
-        stop,
+        shared,
+        behaviour,
         follow_action,
         until_action,
     })
+}
+
+/// The controller behind an action: the first part of its name.
+fn controller_of(action: &str) -> &str {
+    action
+        .trim_start_matches('/')
+        .split('/')
+        .next()
+        .unwrap_or("")
+}
+
+/// What the services and the hardware's thread share.
+struct Shared {
+    stop: AtomicBool,
+    /// The driver's process is gone.
+    dead: AtomicBool,
+    controllers: Mutex<Controllers>,
+}
+
+impl Shared {
+    fn controllers(&self) -> MutexGuard<'_, Controllers> {
+        self.controllers
+            .lock()
+            .unwrap_or_else(PoisonError::into_inner)
+    }
 }
 
 /// The configured node. While it is inactive the cell stays as it is, and nothing is said.
@@ -104,7 +156,8 @@ pub struct HardwareNode {
     /// Its thread has it while the node is active.
     hardware: Option<Hardware>,
     sender: mpsc::SyncSender<Command>,
-    stop: Arc<AtomicBool>,
+    shared: Arc<Shared>,
+    behaviour: HardwareSettings,
     follow_action: String,
     until_action: String,
 }
@@ -115,24 +168,47 @@ impl Active for HardwareNode {
         let mut until = node.action_server::<FollowJointTrajectoryUntil>(&self.until_action)?;
         let mut set_io = node.service_server::<SetIO>("io_and_status_controller/set_io")?;
         let mut reset = node.service_server::<ResetCell>("~/reset")?;
+        let mut list =
+            node.service_server::<ListControllers>("controller_manager/list_controllers")?;
+        let mut switch =
+            node.service_server::<SwitchController>("controller_manager/switch_controller")?;
+        let mut version = node.service_server::<GetRobotSoftwareVersion>(
+            "ur_configuration_controller/get_robot_software_version",
+        )?;
+        let repeats = self.behaviour.strict_actions.then(|| {
+            // rclcpp answers, and throws where it adds the goal to those that it has.
+            (follow.count_repeats(true), until.count_repeats(false))
+        });
+        let mut repeats = repeats.map(|(follow, _)| follow);
         let hardware = self.hardware.take();
         let mut hardware = hardware.context("the hardware's thread has not ended")?;
-        self.stop.store(false, Ordering::Release);
+        self.shared.stop.store(false, Ordering::Release);
         let mut thread = node.spawn_blocking(move || {
             let ended = hardware.run();
             (hardware, ended)
         });
-        let sender = &self.sender;
+        let (sender, shared) = (&self.sender, &self.shared);
+        let alive = || !shared.dead.load(Ordering::Acquire);
         loop {
             tokio::select! {
                 goal = follow.recv() => pass_on(sender, Command::Follow(goal)),
                 goal = until.recv() => pass_on(sender, Command::Until(goal)),
+                () = repeated(&mut repeats) => {
+                    error!("a goal id has come twice: the trajectory controller's process is gone");
+                    pass_on(sender, Command::Die);
+                }
                 (id, request) = set_io.recv() => {
                     let (reply, replied) = oneshot::channel();
                     pass_on(sender, Command::SetIo(request, reply));
-                    // Dropped where the command was not taken.
-                    let success = replied.await.unwrap_or(false);
-                    set_io.respond(id, SetIOResponse { success });
+                    tokio::select! {
+                        // Dropped where the command was not taken.
+                        success = replied => {
+                            let success = success.unwrap_or(false);
+                            set_io.respond(id, SetIOResponse { success });
+                        }
+                        // A dead driver does not answer.
+                        () = node.deactivated() => {}
+                    }
                 }
                 (id, request) = reset.recv() => {
                     let (reply, replied) = oneshot::channel();
@@ -141,19 +217,69 @@ impl Active for HardwareNode {
                         message: "too many other commands wait".into(),
                         ..Default::default()
                     };
-                    reset.respond(id, replied.await.unwrap_or_else(|_| refused()));
+                    tokio::select! {
+                        answer = replied => {
+                            reset.respond(id, answer.unwrap_or_else(|_| refused()));
+                        }
+                        () = node.deactivated() => {}
+                    }
                 }
+                (id, _) = list.recv() => if alive() {
+                    list.respond(id, controllers_of(&shared.controllers()));
+                },
+                (id, request) = switch.recv() => if alive() {
+                    let (activate, deactivate) =
+                        (&request.activate_controllers, &request.deactivate_controllers);
+                    let switched = shared.controllers().switch(activate, deactivate);
+                    switch.respond(id, SwitchControllerResponse {
+                        ok: switched.is_ok(),
+                        message: switched.err().map_or_else(String::new, |error| error.to_string()),
+                    });
+                },
+                (id, _) = version.recv() => if alive() {
+                    version.respond(id, GetRobotSoftwareVersionResponse {
+                        major: self.behaviour.software_major,
+                        ..Default::default()
+                    });
+                },
                 ended = &mut thread => {
                     return ended.context("the hardware's thread panicked")?.1;
                 }
                 () = node.deactivated() => {
-                    self.stop.store(true, Ordering::Release);
+                    self.shared.stop.store(true, Ordering::Release);
                     let (hardware, ended) = thread.await.context("the hardware's thread panicked")?;
                     self.hardware = Some(hardware);
                     return ended;
                 }
             }
         }
+    }
+}
+
+/// Waits for a goal id that has come before; for ever where they are not counted.
+async fn repeated(repeats: &mut Option<tokio::sync::watch::Receiver<u64>>) {
+    if let Some(repeats) = repeats
+        && repeats.changed().await.is_ok()
+    {
+        return;
+    }
+    std::future::pending().await
+}
+
+fn controllers_of(controllers: &Controllers) -> ListControllersResponse {
+    let state = |controller: &driver_model::Controller| ControllerState {
+        name: controller.name.clone(),
+        state: if controller.is_active {
+            "active"
+        } else {
+            "inactive"
+        }
+        .to_owned(),
+        r#type: controller.class.to_owned(),
+        ..Default::default()
+    };
+    ListControllersResponse {
+        controller: controllers.list().iter().map(state).collect(),
     }
 }
 
@@ -169,6 +295,8 @@ enum Command {
     Until(NewGoal<FollowJointTrajectoryUntil>),
     SetIo(SetIORequest, oneshot::Sender<bool>),
     Reset(ResetCellRequest, oneshot::Sender<ResetCellResponse>),
+    /// The driver's process ends.
+    Die,
 }
 
 /// A goal that is being carried out.
@@ -182,6 +310,8 @@ enum End {
     Motion(MotionEnd),
     Failed(Failure),
     Cancelled,
+    /// The driver has ended it, as its controllers do.
+    Withdrawn(Failure),
 }
 
 impl Activity {
@@ -229,14 +359,16 @@ impl Activity {
                 ),
             )
         };
+        let withdrawn = matches!(end, End::Withdrawn(_));
         let (cancelled, failure, triggered) = match end {
             End::Motion(MotionEnd::Reached) => (false, None, false),
             End::Motion(MotionEnd::Contact) => (false, None, true),
             End::Motion(MotionEnd::Lag) => (false, Some(lag()), false),
-            End::Failed(failure) => (false, Some(failure), false),
+            End::Failed(failure) | End::Withdrawn(failure) => (false, Some(failure), false),
             End::Cancelled => (true, None, false),
         };
-        let failed = failure.is_some();
+        let failed = failure.is_some() && !withdrawn;
+        let cancelled = cancelled || withdrawn;
         let (error_code, error_string) = match failure {
             Some(Failure { code, reason }) => (code, reason),
             None if cancelled => (0, "cancelled".to_owned()),
@@ -281,7 +413,20 @@ struct Hardware {
     workcell: Workcell,
     work_cell: WorkCell,
     commands: mpsc::Receiver<Command>,
-    stop: Arc<AtomicBool>,
+    shared: Arc<Shared>,
+    /// Goals of `trajectory_until_node` that wait for their answer.
+    unanswered: AcceptanceQueue<NewGoal<FollowJointTrajectoryUntil>>,
+    /// Replaces the trajectory that was under way.
+    next: Option<Command>,
+    /// Goals of a dead driver: nobody hears of their end.
+    orphans: Vec<Activity>,
+    noise: EncoderNoise,
+    /// What is wrong now.
+    fault: Fault,
+    /// The driver's process has ended by itself.
+    died: bool,
+    /// Origin of the times of the wall clock, and the simulated time then.
+    origin: (Instant, Duration),
     clock: Publisher<Clock>,
     joint_states: Publisher<JointState>,
     /// Of the arm's links.
@@ -293,9 +438,10 @@ struct Hardware {
     tf_static: Publisher<TFMessage>,
     /// Latched, said once; kept so that late joiners hear them.
     _robot_description: Option<Publisher<std_msgs::String>>,
-    _robot_mode: Publisher<RobotMode>,
-    _safety_mode: Publisher<SafetyMode>,
-    _program_running: Publisher<Bool>,
+    robot_mode: Publisher<RobotMode>,
+    safety_mode: Publisher<SafetyMode>,
+    program_running: Publisher<Bool>,
+    tool_data: Publisher<ToolDataMsg>,
     /// What the cameras saw at this rest: one set of frames of perfect cameras, several of noisy ones.
     frames: Vec<Vec<(usize, Frame)>>,
     /// Which set is said next.
@@ -371,6 +517,19 @@ fn noisy_sets(
     Ok(sets)
 }
 
+fn withdrawn(reason: &str) -> End {
+    let code = FollowJointTrajectoryResult::INVALID_GOAL;
+    End::Withdrawn(Failure::new(code, reason))
+}
+
+/// Shortest and longest time until `trajectory_until_node` answers.
+fn answer_range(hardware: &HardwareSettings) -> (Duration, Duration) {
+    (
+        Duration::from_secs_f64(hardware.until_answer_min_s),
+        Duration::from_secs_f64(hardware.until_answer_max_s),
+    )
+}
+
 impl Hardware {
     fn new(
         node: &Node,
@@ -378,7 +537,7 @@ impl Hardware {
         workcell: Workcell,
         work_cell: WorkCell,
         commands: mpsc::Receiver<Command>,
-        stop: Arc<AtomicBool>,
+        shared: Arc<Shared>,
     ) -> anyhow::Result<Self> {
         let cameras = workcell.environment().cell().cameras();
         let topics = cameras
@@ -398,17 +557,10 @@ impl Hardware {
         };
         tf_static.publish(fixed_transforms(&workcell, &work_cell, &parameters)?);
         let status = |name| format!("io_and_status_controller/{name}");
-        let robot_mode = node.publisher(&status("robot_mode"), Qos::Latched)?;
-        robot_mode.publish(RobotMode {
-            mode: RobotMode::RUNNING,
-        });
-        let safety_mode = node.publisher(&status("safety_mode"), Qos::Latched)?;
-        safety_mode.publish(SafetyMode {
-            mode: SafetyMode::NORMAL,
-        });
-        let program_running = node.publisher(&status("robot_program_running"), Qos::Latched)?;
-        program_running.publish(Bool { data: true });
-        Ok(Self {
+        let range = answer_range(&parameters.hardware);
+        let seed = parameters.seed;
+        let origin = (Instant::now(), workcell.time());
+        let hardware = Self {
             // Best effort: the readers of /clock that ros2-client makes acknowledge nothing.
             clock: node.publisher("/clock", Qos::Image)?,
             joint_states: node.publisher("joint_states", Qos::Event)?,
@@ -425,12 +577,20 @@ impl Hardware {
             workcell,
             work_cell,
             commands,
-            stop,
+            shared,
             cameras: topics,
             tf_static,
-            _robot_mode: robot_mode,
-            _safety_mode: safety_mode,
-            _program_running: program_running,
+            robot_mode: node.publisher(&status("robot_mode"), Qos::Latched)?,
+            safety_mode: node.publisher(&status("safety_mode"), Qos::Latched)?,
+            program_running: node.publisher(&status("robot_program_running"), Qos::Latched)?,
+            tool_data: node.publisher(&status("tool_data"), Qos::Event)?,
+            unanswered: AcceptanceQueue::new(range.0, range.1, seed),
+            next: None,
+            orphans: Vec::new(),
+            noise: EncoderNoise::new(seed),
+            fault: Fault::None,
+            died: false,
+            origin,
             frames: Vec::new(),
             next_set: 0,
             sets_taken: 0,
@@ -439,7 +599,9 @@ impl Hardware {
             next_status: Instant::now(),
             next_pins: Instant::now(),
             next_frames: Instant::now(),
-        })
+        };
+        hardware.say_modes();
+        Ok(hardware)
     }
 
     fn run(&mut self) -> anyhow::Result<()> {
@@ -450,14 +612,27 @@ impl Hardware {
             "problem {problem}, seed {seed}: ready at {:?}",
             self.workcell.time()
         );
+        self.origin = (Instant::now(), self.workcell.time());
         self.look()?;
-        while !self.stop.load(Ordering::Acquire) {
+        while !self.is_stopped() {
             self.take_over();
+            if self.is_dead() {
+                // What comes now waits, and is forgotten when the driver is started again.
+                thread::sleep(DEAD_PERIOD);
+                continue;
+            }
+            self.run_on()?;
+            self.answer_goals()?;
             let next = self.next_status.min(self.next_pins).min(self.next_frames);
-            match self
-                .commands
-                .recv_timeout(next.saturating_duration_since(Instant::now()))
-            {
+            let due = self.unanswered.due().map(|due| self.origin.0 + due);
+            let next = due.map_or(next, |due| next.min(due));
+            let command = match self.next.take() {
+                Some(command) => Ok(command),
+                None => self
+                    .commands
+                    .recv_timeout(next.saturating_duration_since(Instant::now())),
+            };
+            match command {
                 Ok(command) => {
                     self.obey(command)?;
                     self.last_command = Instant::now();
@@ -476,6 +651,13 @@ impl Hardware {
                 self.say_pins();
             }
             if now >= self.next_frames {
+                if self.parameters.hardware.free_running
+                    && self.next_set == 0
+                    && self.workcell.is_at_rest()
+                {
+                    // A camera does not repeat images.
+                    self.render()?;
+                }
                 self.say_frames();
             }
         }
@@ -484,16 +666,25 @@ impl Hardware {
 
     fn obey(&mut self, command: Command) -> anyhow::Result<()> {
         let (arm, names) = (&self.work_cell.arm, &self.work_cell.joint_names);
+        let default_rad = self.parameters.hardware.path_tolerance_rad;
         match command {
             Command::Follow(goal) => {
+                if let Some(reason) = self.inactive(controller_of(&self.parameters.follow_action)) {
+                    goal.reject(reason);
+                    return Ok(());
+                }
                 let (goal, running) = goal.accept();
+                let tolerances = path_tolerances(&goal.path_tolerance, names, default_rad);
                 let trajectory = follow_trajectory(&goal, arm, names);
-                self.carry_out(Activity::Follow(running), trajectory, false)
+                self.carry_out(Activity::Follow(running), trajectory, false, &tolerances)
             }
             Command::Until(goal) => {
-                let (goal, running) = goal.accept();
-                let trajectory = until_trajectory(&goal, arm, names);
-                self.carry_out(Activity::Until(running), trajectory, true)
+                self.unanswered.push(goal, self.now());
+                self.answer_goals()
+            }
+            Command::Die => {
+                self.die();
+                Ok(())
             }
             Command::SetIo(request, reply) => {
                 self.set_io(&request, reply);
@@ -508,12 +699,47 @@ impl Hardware {
         }
     }
 
-    /// What can be obeyed while a goal is active.
-    fn obey_meanwhile(&mut self, command: Command) {
+    /// Answers the goals of `trajectory_until_node` whose time has come.
+    fn answer_goals(&mut self) -> anyhow::Result<()> {
+        while let Some(answer) = self.unanswered.pop(self.now(), false) {
+            // A goal is carried out before the next one has its turn.
+            let (Answer::Accept(goal) | Answer::Busy(goal)) = answer;
+            let follow = controller_of(&self.parameters.follow_action);
+            let inactive = self
+                .inactive(follow)
+                .or_else(|| self.inactive(TOOL_CONTACT));
+            if let Some(reason) = inactive {
+                goal.reject(reason);
+                continue;
+            }
+            let (goal, running) = goal.accept();
+            let (arm, names) = (&self.work_cell.arm, &self.work_cell.joint_names);
+            let default_rad = self.parameters.hardware.path_tolerance_rad;
+            let tolerances = path_tolerances(&goal.path_tolerance, names, default_rad);
+            let trajectory = until_trajectory(&goal, arm, names);
+            self.carry_out(Activity::Until(running), trajectory, true, &tolerances)?;
+        }
+        Ok(())
+    }
+
+    /// Why a controller takes no goals.
+    fn inactive(&self, controller: &str) -> Option<String> {
+        if !self.fault.modes().program_running {
+            return Some(format!("{controller} does not run: {:?}", self.fault));
+        }
+        let active = self.shared.controllers().is_active(controller);
+        (!active).then(|| format!("{controller} is not active"))
+    }
+
+    /// What can be obeyed while a goal is active. Returns what ends that goal.
+    fn obey_meanwhile(&mut self, command: Command) -> Option<Command> {
         let reason = "another goal is active";
         match command {
+            // A trajectory controller takes the newest.
+            Command::Follow(_) if self.parameters.hardware.strict_actions => return Some(command),
             Command::Follow(goal) => goal.reject(reason),
-            Command::Until(goal) => goal.reject(reason),
+            Command::Until(goal) => self.unanswered.push(goal, self.now()),
+            Command::Die => return Some(command),
             Command::SetIo(request, reply) => self.set_io(&request, reply),
             Command::Reset(request, reply) => {
                 let known = self.resets.answered(&request.request_id);
@@ -523,6 +749,15 @@ impl Hardware {
                 });
                 let _ = reply.send(answer);
             }
+        }
+        None
+    }
+
+    /// Rejects the goals of `trajectory_until_node` whose time has come while another goal is active.
+    fn reject_goals(&mut self) {
+        while let Some(answer) = self.unanswered.pop(self.now(), true) {
+            let (Answer::Accept(goal) | Answer::Busy(goal)) = answer;
+            goal.reject("another goal is active");
         }
     }
 
@@ -597,9 +832,12 @@ impl Hardware {
         goal: Activity,
         trajectory: Result<JointTrajectory, Failure>,
         until_contact: bool,
+        tolerances: &Joints,
     ) -> anyhow::Result<()> {
-        let begun =
-            trajectory.and_then(|trajectory| self.workcell.begin(trajectory, until_contact));
+        // Where the arm still brakes, it brakes no longer.
+        self.workcell.halt();
+        let begun = trajectory
+            .and_then(|trajectory| self.workcell.begin(trajectory, until_contact, tolerances));
         if let Err(failure) = begun {
             warn!("goal aborted: {failure}");
             goal.end(End::Failed(failure));
@@ -611,7 +849,13 @@ impl Hardware {
             End::Failed(failure) => error!("goal aborted: {failure}"),
             End::Motion(MotionEnd::Lag) => warn!("goal aborted: the suction tip lags behind"),
             End::Motion(_) => {}
-            End::Cancelled => info!("goal cancelled, the arm stands still"),
+            End::Cancelled => info!("goal cancelled, the arm stops"),
+            End::Withdrawn(failure) => warn!("goal withdrawn: {failure}"),
+        }
+        if self.is_dead() {
+            // Nobody hears how it ends.
+            self.orphans.push(goal);
+            return Ok(());
         }
         // Whoever hears of the end can know where it led to.
         self.say_pins_if_changed();
@@ -625,8 +869,67 @@ impl Hardware {
             });
         }
         goal.end(end);
+        self.coast()?;
         if self.workcell.is_at_rest() {
             self.look()?;
+        }
+        Ok(())
+    }
+
+    /// Lets an arm that brakes come to rest.
+    fn coast(&mut self) -> anyhow::Result<()> {
+        if !self.workcell.is_moving() {
+            return Ok(());
+        }
+        let begin = (Instant::now(), self.workcell.time());
+        while self.workcell.is_moving() {
+            match self.workcell.step(self.now()) {
+                Step::Moving | Step::Deviated(_) => {}
+                Step::Ended(_) => break,
+                Step::Failed(reason) => {
+                    error!("braking: {reason}");
+                    break;
+                }
+            }
+            if Instant::now() >= self.next_status {
+                self.say_status()?;
+            }
+            self.pace(begin);
+        }
+        self.say_status()
+    }
+
+    /// Time of the wall clock, from an origin of its own.
+    fn now(&self) -> Duration {
+        self.origin.0.elapsed()
+    }
+
+    fn is_stopped(&self) -> bool {
+        self.shared.stop.load(Ordering::Acquire)
+    }
+
+    fn is_dead(&self) -> bool {
+        self.died || self.fault == Fault::DriverDead
+    }
+
+    /// The driver's process is gone: the robot stops by itself, and nobody hears of it.
+    fn die(&mut self) {
+        self.died = true;
+        self.shared.dead.store(true, Ordering::Release);
+    }
+
+    /// Lets time go on with the wall clock where nothing moves.
+    fn run_on(&mut self) -> anyhow::Result<()> {
+        let now = self.now();
+        if !self.parameters.hardware.free_running {
+            // The vacuum takes its time all the same.
+            self.workcell.update_vacuum(now, false);
+            return Ok(());
+        }
+        // A host that is behind catches up little by little.
+        let due = (self.origin.1 + now).min(self.workcell.time() + MOST_CATCH_UP);
+        while self.workcell.time() < due {
+            self.workcell.pass_time(now).map_err(anyhow::Error::msg)?;
         }
         Ok(())
     }
@@ -640,15 +943,41 @@ impl Hardware {
         let mut next_feedback = begin.1 + FEEDBACK_PERIOD;
         loop {
             while let Ok(command) = self.commands.try_recv() {
-                self.obey_meanwhile(command);
+                match self.obey_meanwhile(command) {
+                    None => {}
+                    Some(Command::Die) => self.die(),
+                    Some(command) => {
+                        self.workcell.halt();
+                        self.next = Some(command);
+                        return Ok(withdrawn("a newer trajectory has come"));
+                    }
+                }
             }
-            if goal.is_cancel_requested() || self.stop.load(Ordering::Acquire) {
+            self.reject_goals();
+            if goal.is_cancel_requested() || self.is_stopped() {
                 self.workcell.cancel();
                 return Ok(End::Cancelled);
             }
-            match self.workcell.step() {
+            if self.is_dead() {
+                self.workcell.cancel();
+                self.coast_unheard();
+                return Ok(withdrawn("the driver is gone"));
+            }
+            if !self.fault.lets_move() {
+                self.workcell.cancel();
+                return Ok(withdrawn(&format!(
+                    "the robot has stopped: {:?}",
+                    self.fault
+                )));
+            }
+            match self.workcell.step(self.now()) {
                 Step::Moving => {}
                 Step::Ended(end) => return Ok(End::Motion(end)),
+                Step::Deviated(deviation) => {
+                    self.workcell.cancel();
+                    let code = FollowJointTrajectoryResult::PATH_TOLERANCE_VIOLATED;
+                    return Ok(End::Failed(Failure::new(code, deviation.to_string())));
+                }
                 Step::Failed(reason) => {
                     self.workcell.cancel();
                     let code = FollowJointTrajectoryResult::INVALID_GOAL;
@@ -659,6 +988,7 @@ impl Hardware {
             let tick = tick_of(time, rate_hz);
             if tick != said {
                 said = tick;
+                self.take_over();
                 self.say_status()?;
             }
             if time >= next_feedback {
@@ -674,44 +1004,86 @@ impl Hardware {
 
     /// The parameters that may be set at run time.
     fn take_over(&mut self) {
-        self.parameters = self
-            .node
-            .parameters::<SimWorkcellParameters>()
-            .borrow()
-            .clone();
+        let parameters = self.node.parameters::<SimWorkcellParameters>();
+        let unchanged = *parameters.borrow() == self.parameters;
+        if unchanged && self.parameters.hardware.fault == self.fault {
+            return;
+        }
+        self.parameters = parameters.borrow().clone();
+        let hardware = &self.parameters.hardware;
+        self.workcell.set_hardware(hardware);
+        let range = answer_range(hardware);
+        self.unanswered.set_range(range.0, range.1);
+        let (before, fault) = (self.fault, hardware.fault);
+        if before == fault {
+            return;
+        }
+        warn!("hardware.fault is {fault:?}, was {before:?}");
+        self.fault = fault;
+        self.shared.dead.store(self.is_dead(), Ordering::Release);
+        if before == Fault::DriverDead && !self.died {
+            // Started again, it knows nothing of what was.
+            for goal in self.unanswered.clear() {
+                goal.reject("the driver was started again");
+            }
+            while self.commands.try_recv().is_ok() {}
+            self.orphans.clear();
+            self.next_status = Instant::now();
+        }
+        self.say_modes();
+    }
+
+    fn say_modes(&self) {
+        if self.is_dead() {
+            return;
+        }
+        let modes = self.fault.modes();
+        self.robot_mode.publish(RobotMode {
+            mode: modes.robot_mode,
+        });
+        self.safety_mode.publish(SafetyMode {
+            mode: modes.safety_mode,
+        });
+        self.program_running.publish(Bool {
+            data: modes.program_running,
+        });
+    }
+
+    /// An arm whose driver is gone brakes by itself.
+    fn coast_unheard(&mut self) {
+        let begin = (Instant::now(), self.workcell.time());
+        while self.workcell.is_moving() {
+            if !matches!(
+                self.workcell.step(self.now()),
+                Step::Moving | Step::Deviated(_)
+            ) {
+                break;
+            }
+            self.pace(begin);
+        }
+        self.workcell.halt();
     }
 
     /// Waits where simulated time is to run no faster than a multiple of the wall clock's.
     fn pace(&self, begin: (Instant, Duration)) {
-        let factor = self.parameters.real_time_factor;
+        let factor = match self.parameters.real_time_factor {
+            0.0 if self.parameters.hardware.free_running => 1.0,
+            factor => factor,
+        };
         if factor > 0.0 {
             let due = (self.workcell.time() - begin.1).div_f64(factor);
             thread::sleep(due.saturating_sub(begin.0.elapsed()));
         }
     }
 
-    /// Renders the cameras' frames, and says them.
+    /// Renders the cameras' frames and publishes them.
     fn look(&mut self) -> anyhow::Result<()> {
         let time = self.workcell.time();
         let settled = self.workcell.environment().cell().is_settled();
         if !settled {
             warn!("the bodies have not come to rest; the frames show them in motion");
         }
-        let rig = self.workcell.environment().rig().cloned();
-        let cell = self.workcell.environment_mut().cell_mut();
-        let cameras = cell.cameras().to_vec();
-        let images = cell.render()?;
-        self.frames = match &rig {
-            None => {
-                let frames = cameras.iter().zip(images).enumerate();
-                let frames = frames
-                    .map(|(index, (camera, image))| Ok((index, Frame::new(camera, image, time)?)));
-                vec![frames.collect::<Result<_, ConvertError>>()?]
-            }
-            Some(rig) => noisy_sets(rig, &cameras, images, time, self.sets_taken)?,
-        };
-        self.sets_taken += self.frames.len() as u64;
-        self.next_set = 0;
+        self.render()?;
         self.say_frames();
         let environment = self.workcell.environment();
         let level = if settled { Level::Ok } else { Level::Warn };
@@ -732,20 +1104,49 @@ impl Hardware {
         Ok(())
     }
 
+    /// Renders what the cameras see now.
+    fn render(&mut self) -> anyhow::Result<()> {
+        let time = self.workcell.time();
+        let rig = self.workcell.environment().rig().cloned();
+        let cell = self.workcell.environment_mut().cell_mut();
+        let cameras = cell.cameras().to_vec();
+        let images = cell.render()?;
+        self.frames = match &rig {
+            None => {
+                let frames = cameras.iter().zip(images).enumerate();
+                let frames = frames
+                    .map(|(index, (camera, image))| Ok((index, Frame::new(camera, image, time)?)));
+                vec![frames.collect::<Result<_, ConvertError>>()?]
+            }
+            Some(rig) => noisy_sets(rig, &cameras, images, time, self.sets_taken)?,
+        };
+        self.sets_taken += self.frames.len() as u64;
+        self.next_set = 0;
+        Ok(())
+    }
+
     fn header(&self) -> anyhow::Result<Header> {
         let time = self.workcell.time();
         Ok(convert::header(time, &self.parameters.world_frame)?)
     }
 
     fn say_status(&mut self) -> anyhow::Result<()> {
+        self.next_status = self.after(self.status_period_s());
+        if self.is_dead() {
+            return Ok(());
+        }
         let header = self.header()?;
-        self.clock.publish(Clock {
-            clock: header.stamp,
-        });
+        if !self.parameters.hardware.free_running {
+            self.clock.publish(Clock {
+                clock: header.stamp,
+            });
+        }
+        let deviation_rad = self.parameters.hardware.encoder_noise_rad;
+        let joints_rad = self.noise.read(&self.workcell.joints_rad(), deviation_rad);
         self.joint_states.publish(convert::joint_state_to_msg(
             header,
             &self.work_cell.joint_names,
-            &self.workcell.joints_rad(),
+            &joints_rad,
             &self.workcell.velocities_rad_s(),
         ));
         if let Some(tf) = &self.tf {
@@ -757,11 +1158,14 @@ impl Hardware {
                 self.workcell.time(),
             )?);
         }
-        self.next_status = self.after(self.status_period_s());
         Ok(())
     }
 
     fn say_pins(&mut self) {
+        if self.is_dead() {
+            return;
+        }
+        self.tool_data.publish(self.workcell.tool_data());
         self.said_pins = self.workcell.io_states();
         self.io_states.publish(self.said_pins.clone());
         self.next_pins = self.after(self.status_period_s());

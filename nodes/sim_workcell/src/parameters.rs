@@ -2,6 +2,7 @@
 
 use std::path::PathBuf;
 
+use driver_model::HardwareSettings;
 use node_kit::{Parameters, Range};
 use serde::{Deserialize, Serialize};
 
@@ -40,6 +41,8 @@ pub struct SimWorkcellParameters {
     pub frames_period_s: f64,
     /// What the cameras do: a file as those of config/perturbations; empty for perfect ones.
     pub perturbation: PathBuf,
+    /// How the driver behaves; an ideal one by default.
+    pub hardware: HardwareSettings,
 }
 
 impl Default for SimWorkcellParameters {
@@ -60,12 +63,15 @@ impl Default for SimWorkcellParameters {
             status_period_s: 0.02,
             frames_period_s: 1.0,
             perturbation: PathBuf::new(),
+            hardware: HardwareSettings::default(),
         }
     }
 }
 
 /// Times of the wall clock, in s.
 const PERIOD: Range = Range::Float(0.001, 3600.0);
+/// Times that hardware takes, in s.
+const DELAY: Range = Range::Float(0.0, 60.0);
 /// Pins of the control box and the tool.
 const PIN: Range = Range::Integer(0, 17);
 
@@ -80,9 +86,31 @@ impl Parameters for SimWorkcellParameters {
         ("joint_states_rate_hz", Range::Float(1.0, 480.0)),
         ("status_period_s", PERIOD),
         ("frames_period_s", PERIOD),
+        ("hardware.until_answer_min_s", DELAY),
+        ("hardware.until_answer_max_s", DELAY),
+        ("hardware.servo_delay_s", Range::Float(0.0, 1.0)),
+        ("hardware.path_tolerance_rad", Range::POSITIVE),
+        ("hardware.encoder_noise_rad", Range::Float(0.0, 0.1)),
+        ("hardware.speed_scaling", Range::Float(0.01, 1.0)),
+        ("hardware.braking_time_s", Range::Float(0.0, 1.0)),
+        ("hardware.software_major", Range::Integer(3, 10)),
+        ("hardware.tool_voltage", Range::Integer(0, 24)),
+        ("hardware.vacuum_build_s", DELAY),
+        ("hardware.vacuum_release_s", DELAY),
+        ("hardware.vacuum_leak_s", Range::NOT_NEGATIVE),
     ];
-    const CHANGEABLE: &'static [&'static str] =
-        &["real_time_factor", "status_period_s", "frames_period_s"];
+    const CHANGEABLE: &'static [&'static str] = &[
+        "real_time_factor",
+        "status_period_s",
+        "frames_period_s",
+        "hardware.until_answer_min_s",
+        "hardware.until_answer_max_s",
+        "hardware.servo_delay_s",
+        "hardware.encoder_noise_rad",
+        "hardware.speed_scaling",
+        "hardware.vacuum_leak_s",
+        "hardware.fault",
+    ];
 }
 
 #[cfg(test)]
@@ -102,6 +130,8 @@ mod tests {
             ("real_time_factor: -1.0", "real_time_factor"),
             ("joint_states_rate_hz: .nan", "joint_states_rate_hz"),
             ("frames_period_s: 0.0", "frames_period_s"),
+            ("hardware: {speed_scaling: 0.0}", "hardware.speed_scaling"),
+            ("hardware: {fault: bad}", "hardware.fault"),
             ("sead: 3", "sead"),
         ] {
             let text = format!("/**:\n  ros__parameters:\n    {line}\n");

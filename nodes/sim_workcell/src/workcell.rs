@@ -4,8 +4,9 @@ use std::collections::BTreeMap;
 use std::time::Duration;
 
 use camera_noise::Perturbation;
+use driver_model::{HardwareSettings, PathDeviation, Servo, Vacuum};
 use msgs::control_msgs::FollowJointTrajectoryResult;
-use msgs::ur_msgs::{Digital, IOStates, SetIORequest};
+use msgs::ur_msgs::{Digital, IOStates, SetIORequest, ToolDataMsg};
 use multiravens::{Assessment, Environment, EnvironmentError, MotionEnd, Problem, Tick};
 use ur5::{JointTrajectory, Joints, WorkCell};
 
@@ -13,6 +14,8 @@ use crate::driver::Failure;
 
 /// Pins of a UR controller: 0 to 7 standard, 8 to 15 configurable, 16 and 17 at the tool.
 const PINS: u8 = 18;
+/// From this pin on they have power only where the tool has.
+const TOOL_PINS_FROM: u8 = 16;
 
 /// Which pins suction is wired to.
 #[derive(Clone, Copy, Debug)]
@@ -36,10 +39,28 @@ pub(crate) struct Workcell {
     outputs: BTreeMap<u8, bool>,
     flags: BTreeMap<u8, bool>,
     velocities_rad_s: Joints,
+    /// How the driver behaves.
+    hardware: HardwareSettings,
+    vacuum: Vacuum,
+    /// What the valve was told.
+    valve: bool,
+    /// What was held has been lost to a leak; nothing is gripped until the valve was closed.
+    leaked: bool,
+    /// What the arm follows, where it does not follow exactly.
+    followed: Option<Followed>,
     /// The last goal has ended with the arm at home, nothing held, and the bodies settled.
     rests: bool,
     /// The rewards of this rest have been told.
     assessed: bool,
+}
+
+/// A trajectory that a servo loop follows.
+struct Followed {
+    servo: Servo,
+    desired: JointTrajectory,
+    actual: JointTrajectory,
+    tolerances_rad: Joints,
+    begin: Duration,
 }
 
 /// What a step of the physics has done.
@@ -47,6 +68,8 @@ pub(crate) struct Workcell {
 pub(crate) enum Step {
     Moving,
     Ended(MotionEnd),
+    /// A joint was too far from its trajectory.
+    Deviated(PathDeviation),
     Failed(String),
 }
 
@@ -58,6 +81,7 @@ impl Workcell {
         seed: u64,
         wiring: Wiring,
         perturbation: Option<Perturbation>,
+        hardware: HardwareSettings,
     ) -> Result<Self, EnvironmentError> {
         let mut environment = Environment::new(problem, work_cell);
         environment.set_perturbation(perturbation.as_ref());
@@ -70,6 +94,11 @@ impl Workcell {
             outputs: (0..PINS).map(|pin| (pin, false)).collect(),
             flags: BTreeMap::new(),
             velocities_rad_s: Joints::zeros(),
+            hardware,
+            vacuum: Vacuum::default(),
+            valve: false,
+            leaked: false,
+            followed: None,
             rests: true,
             assessed: true,
         })
@@ -88,10 +117,26 @@ impl Workcell {
             seed,
             self.wiring,
             self.perturbation.clone(),
+            self.hardware.clone(),
         )?;
         let past = self.time() + PAUSE;
         *self = Self { past, ..next };
         Ok(())
+    }
+
+    /// Lets the time begin at `time`, for an episode that has just begun.
+    pub(crate) fn begin_at(&mut self, time: Duration) {
+        self.past = time.saturating_sub(self.environment.cell().time());
+    }
+
+    /// Takes over what may change while the node is active.
+    pub(crate) fn set_hardware(&mut self, hardware: &HardwareSettings) {
+        let tool_voltage = self.hardware.tool_voltage;
+        self.hardware = HardwareSettings {
+            // Set by the robot's program, too.
+            tool_voltage,
+            ..hardware.clone()
+        };
     }
 
     pub(crate) fn environment(&self) -> &Environment {
@@ -115,33 +160,52 @@ impl Workcell {
         self.velocities_rad_s
     }
 
-    /// Begins a goal.
+    /// Begins a goal. `tolerances_rad`: how far each joint may be from its trajectory; a negative one allows everything.
     pub(crate) fn begin(
         &mut self,
         trajectory: JointTrajectory,
         until_contact: bool,
+        tolerances_rad: &Joints,
     ) -> Result<(), Failure> {
+        let invalid = |reason: String| {
+            Failure::new(FollowJointTrajectoryResult::INVALID_GOAL, one_line(&reason))
+        };
+        let servo = Servo::new(self.hardware.servo_delay_s, self.hardware.speed_scaling);
+        let actual = servo
+            .actual(&trajectory)
+            .map_err(|error| invalid(error.to_string()))?;
+        let braking = self.hardware.braking_time_s > 0.0;
+        let followed = (braking || !servo.is_ideal()).then(|| Followed {
+            servo,
+            desired: trajectory,
+            actual: actual.clone(),
+            tolerances_rad: *tolerances_rad,
+            begin: self.time(),
+        });
         let cell = self.environment.cell_mut();
-        cell.begin(trajectory, until_contact).map_err(|error| {
-            let code = FollowJointTrajectoryResult::INVALID_GOAL;
-            Failure::new(code, one_line(&error.to_string()))
-        })?;
+        cell.begin(actual, until_contact)
+            .map_err(|error| invalid(error.to_string()))?;
+        self.followed = followed;
         self.rests = false;
         self.assessed = false;
         Ok(())
     }
 
-    /// One physics step.
-    pub(crate) fn step(&mut self) -> Step {
+    /// One physics step. `now`: time of the wall clock, from any origin.
+    pub(crate) fn step(&mut self, now: Duration) -> Step {
         let (before_rad, before) = (self.joints_rad(), self.time());
         let ticked = self.environment.cell_mut().tick();
+        self.update_vacuum(now, true);
         let elapsed_s = (self.time() - before).as_secs_f64();
         self.velocities_rad_s = match ticked {
             Ok(Tick::Moving) if elapsed_s > 0.0 => (self.joints_rad() - before_rad) / elapsed_s,
             _ => Joints::zeros(),
         };
         match ticked {
-            Ok(Tick::Moving) => Step::Moving,
+            Ok(Tick::Moving) => match self.deviation() {
+                Some(deviation) => Step::Deviated(deviation),
+                None => Step::Moving,
+            },
             Ok(Tick::Ended(end)) => {
                 let cell = self.environment.cell();
                 self.rests = cell.is_home() && !cell.is_holding();
@@ -152,10 +216,96 @@ impl Workcell {
         }
     }
 
-    /// Stops at once: the simulated arm has no momentum.
+    /// Where the arm has left its trajectory.
+    fn deviation(&self) -> Option<PathDeviation> {
+        let followed = self.followed.as_ref()?;
+        let elapsed = self.time() - followed.begin;
+        // Later than that the arm only waits.
+        let moves = elapsed <= followed.actual.duration();
+        let (joints, tolerances) = (self.joints_rad(), &followed.tolerances_rad);
+        let check = || {
+            followed
+                .servo
+                .check(&followed.desired, elapsed, &joints, tolerances)
+        };
+        moves.then(check)?.err()
+    }
+
+    /// One physics step while no goal is active.
+    pub(crate) fn pass_time(&mut self, now: Duration) -> Result<(), String> {
+        let passed = self.environment.cell_mut().pass_time();
+        self.update_vacuum(now, false);
+        passed.map_err(|error| one_line(&error.to_string()))
+    }
+
+    /// Stops the motion under way. An arm without inertia stands still at once; another one brakes: `step` goes on until it ends.
     pub(crate) fn cancel(&mut self) {
-        self.environment.cell_mut().cancel();
+        let was_moving = self.environment.cell_mut().cancel();
         self.velocities_rad_s = Joints::zeros();
+        let Some(followed) = self.followed.take().filter(|_| was_moving) else {
+            return;
+        };
+        let braking = Duration::from_secs_f64(self.hardware.braking_time_s);
+        if braking.is_zero() {
+            return;
+        }
+        let elapsed = self.time() - followed.begin;
+        let brake = Servo::brake(&followed.actual, elapsed, braking);
+        let cell = self.environment.cell_mut();
+        // Where there is no way to brake, the arm stands still at once.
+        if let Ok(brake) = brake {
+            let _ = cell.begin(brake, false);
+        }
+    }
+
+    /// Stops the motion under way at once.
+    pub(crate) fn halt(&mut self) {
+        self.environment.cell_mut().cancel();
+        self.followed = None;
+        self.velocities_rad_s = Joints::zeros();
+    }
+
+    /// Whether something moves the arm.
+    pub(crate) fn is_moving(&self) -> bool {
+        self.environment.cell().is_moving()
+    }
+
+    fn vacuum_is_ideal(&self) -> bool {
+        let HardwareSettings {
+            vacuum_build_s,
+            vacuum_release_s,
+            vacuum_leak_s,
+            ..
+        } = self.hardware;
+        vacuum_build_s == 0.0 && vacuum_release_s == 0.0 && vacuum_leak_s == 0.0
+    }
+
+    /// Whether a pin has power.
+    fn has_power(&self, pin: u8) -> bool {
+        pin < TOOL_PINS_FROM || self.hardware.tool_voltage > 0
+    }
+
+    /// Brings the vacuum to a time. `moving`: whether the cup may have met something.
+    pub(crate) fn update_vacuum(&mut self, now: Duration, moving: bool) {
+        if self.vacuum_is_ideal() {
+            return;
+        }
+        let suction = self.valve && self.has_power(self.wiring.suction_pin);
+        self.leaked &= suction;
+        let cell = self.environment.cell_mut();
+        if suction && !self.leaked && !cell.is_holding() && (moving || !cell.suction()) {
+            // The cup grips what it touches at the moment when suction goes on.
+            cell.set_suction(false);
+            cell.set_suction(true);
+        }
+        let closed = cell.is_holding();
+        let stays = self.vacuum.update(&self.hardware, now, suction, closed);
+        if closed && !stays {
+            cell.set_suction(false);
+            self.leaked = suction;
+        } else if !suction && !closed && cell.suction() {
+            cell.set_suction(false);
+        }
     }
 
     /// Whether the cameras may look: a goal (or the reset) has brought the arm home with nothing
@@ -190,7 +340,11 @@ impl Workcell {
             SetIORequest::FUN_SET_DIGITAL_OUT => {
                 let (pin, level) = (pin(PINS)?, level()?);
                 if pin == self.wiring.suction_pin {
-                    self.environment.cell_mut().set_suction(level);
+                    self.valve = level;
+                    if self.vacuum_is_ideal() {
+                        let level = level && self.has_power(pin);
+                        self.environment.cell_mut().set_suction(level);
+                    }
                 } else {
                     self.outputs.insert(pin, level);
                 }
@@ -198,15 +352,32 @@ impl Workcell {
             SetIORequest::FUN_SET_FLAG => {
                 self.flags.insert(pin(128)?, level()?);
             }
+            SetIORequest::FUN_SET_TOOL_VOLTAGE => {
+                let volts = [0_u8, 12, 24];
+                let found = volts
+                    .into_iter()
+                    .find(|volts| f32::from(*volts) == request.state);
+                self.hardware.tool_voltage = found
+                    .ok_or_else(|| format!("state is {}, expected 0, 12 or 24 V", request.state))?;
+            }
             other => {
                 return Err(format!(
-                    "fun is {other}, expected FUN_SET_DIGITAL_OUT ({}) or FUN_SET_FLAG ({})",
+                    "fun is {other}, expected FUN_SET_DIGITAL_OUT ({}), FUN_SET_FLAG ({}) or FUN_SET_TOOL_VOLTAGE ({})",
                     SetIORequest::FUN_SET_DIGITAL_OUT,
-                    SetIORequest::FUN_SET_FLAG
+                    SetIORequest::FUN_SET_FLAG,
+                    SetIORequest::FUN_SET_TOOL_VOLTAGE
                 ));
             }
         }
         Ok(())
+    }
+
+    pub(crate) fn tool_data(&self) -> ToolDataMsg {
+        ToolDataMsg {
+            tool_output_voltage: self.hardware.tool_voltage,
+            tool_mode: ToolDataMsg::TOOL_RUNNING_MODE,
+            ..Default::default()
+        }
     }
 
     pub(crate) fn io_states(&self) -> IOStates {
@@ -215,10 +386,14 @@ impl Workcell {
             suction_pin,
             vacuum_pin,
         } = self.wiring;
+        let senses = match self.vacuum_is_ideal() {
+            true => cell.is_holding(),
+            false => self.vacuum.senses() && self.has_power(vacuum_pin),
+        };
         let digital = |(pin, state)| Digital { pin, state };
         IOStates {
             digital_in_states: (0..PINS)
-                .map(|pin| (pin, pin == vacuum_pin && cell.is_holding()))
+                .map(|pin| (pin, pin == vacuum_pin && senses))
                 .map(digital)
                 .collect(),
             digital_out_states: self
@@ -228,7 +403,7 @@ impl Workcell {
                     (
                         *pin,
                         if *pin == suction_pin {
-                            cell.suction()
+                            self.valve
                         } else {
                             *state
                         },
@@ -270,9 +445,23 @@ mod tests {
     fn workcell() -> (Workcell, WorkCell) {
         let work_cell = WorkCell::builtin().unwrap();
         (
-            Workcell::new(&problem(), &work_cell, 10_000, WIRING, None).unwrap(),
+            Workcell::new(
+                &problem(),
+                &work_cell,
+                10_000,
+                WIRING,
+                None,
+                HardwareSettings::default(),
+            )
+            .unwrap(),
             work_cell,
         )
+    }
+
+    const NOW: Duration = Duration::ZERO;
+
+    fn any() -> Joints {
+        Joints::repeat(-1.0)
     }
 
     fn set(pin: i8, state: f32) -> SetIORequest {
@@ -325,6 +514,13 @@ mod tests {
             (set(16, f32::NAN), "state is NaN"),
             (
                 SetIORequest {
+                    fun: SetIORequest::FUN_SET_TOOL_VOLTAGE,
+                    ..set(0, 13.0)
+                },
+                "expected 0, 12 or 24 V",
+            ),
+            (
+                SetIORequest {
                     fun: 3,
                     ..set(0, 1.0)
                 },
@@ -345,17 +541,17 @@ mod tests {
         let start = workcell.time();
         let trajectory =
             follow_trajectory(&turn(&work_cell), &work_cell.arm, &work_cell.joint_names).unwrap();
-        workcell.begin(trajectory.clone(), false).unwrap();
-        assert_eq!(workcell.step(), Step::Moving);
-        assert!(workcell.begin(trajectory.clone(), false).is_err());
-        while workcell.step() == Step::Moving {}
+        workcell.begin(trajectory.clone(), false, &any()).unwrap();
+        assert_eq!(workcell.step(NOW), Step::Moving);
+        assert!(workcell.begin(trajectory.clone(), false, &any()).is_err());
+        while workcell.step(NOW) == Step::Moving {}
         assert!(workcell.time() - start >= Duration::from_secs(1));
         assert!((workcell.joints_rad() - trajectory.last().positions_rad).amax() < 1e-12);
         assert_eq!(workcell.velocities_rad_s(), Joints::zeros());
         assert!(!workcell.is_at_rest());
         assert_eq!(workcell.assess(), None);
         // From here the same trajectory would jump.
-        let failure = workcell.begin(trajectory, false).unwrap_err();
+        let failure = workcell.begin(trajectory, false, &any()).unwrap_err();
         assert!(failure.reason.contains("starts at"), "{failure}");
     }
 
@@ -365,8 +561,8 @@ mod tests {
         let start = (workcell.time(), workcell.environment().state_hash());
         let trajectory =
             follow_trajectory(&turn(&work_cell), &work_cell.arm, &work_cell.joint_names).unwrap();
-        workcell.begin(trajectory, false).unwrap();
-        while workcell.step() == Step::Moving {}
+        workcell.begin(trajectory, false, &any()).unwrap();
+        while workcell.step(NOW) == Step::Moving {}
         workcell.set_io(&set(16, 1.0)).unwrap();
         let before = workcell.time();
         workcell.reset(&problem(), &work_cell, 10_002).unwrap();
@@ -383,15 +579,82 @@ mod tests {
         let (mut workcell, work_cell) = workcell();
         let trajectory =
             follow_trajectory(&turn(&work_cell), &work_cell.arm, &work_cell.joint_names).unwrap();
-        workcell.begin(trajectory, false).unwrap();
+        workcell.begin(trajectory, false, &any()).unwrap();
         for _ in 0..200 {
-            assert_eq!(workcell.step(), Step::Moving);
+            assert_eq!(workcell.step(NOW), Step::Moving);
         }
         assert!(workcell.velocities_rad_s().amax() > 0.0);
         workcell.cancel();
         let (time, joints) = (workcell.time(), workcell.joints_rad());
-        assert!(matches!(workcell.step(), Step::Failed(_)));
+        assert!(matches!(workcell.step(NOW), Step::Failed(_)));
         assert_eq!((workcell.time(), workcell.joints_rad()), (time, joints));
         assert_eq!(workcell.velocities_rad_s(), Joints::zeros());
+    }
+
+    fn behaving(hardware: HardwareSettings) -> (Workcell, WorkCell) {
+        let (_, work_cell) = workcell();
+        let problem = problem();
+        let workcell = Workcell::new(&problem, &work_cell, 10_000, WIRING, None, hardware);
+        (workcell.unwrap(), work_cell)
+    }
+
+    #[test]
+    fn an_arm_that_lags_behind_leaves_a_tight_tolerance_and_keeps_a_loose_one() {
+        let (mut workcell, work_cell) = behaving(HardwareSettings {
+            servo_delay_s: 0.05,
+            braking_time_s: 0.1,
+            ..HardwareSettings::default()
+        });
+        let trajectory =
+            follow_trajectory(&turn(&work_cell), &work_cell.arm, &work_cell.joint_names).unwrap();
+        let end = trajectory.last().positions_rad;
+        let begin = workcell.begin(trajectory.clone(), false, &Joints::repeat(0.002));
+        begin.unwrap();
+        let deviation = loop {
+            match workcell.step(NOW) {
+                Step::Moving => {}
+                Step::Deviated(deviation) => break deviation,
+                other => panic!("{other:?}"),
+            }
+        };
+        assert_eq!(deviation.joint, 0);
+        // The arm brakes on its way, and stands.
+        let at_deviation = workcell.joints_rad()[0];
+        workcell.cancel();
+        assert!(workcell.is_moving());
+        while workcell.is_moving() {
+            workcell.step(NOW);
+        }
+        let braked = workcell.joints_rad()[0] - at_deviation;
+        assert!(0.0 < braked && braked < 0.01, "{braked}");
+
+        let (mut workcell, _) = behaving(HardwareSettings {
+            servo_delay_s: 0.05,
+            ..HardwareSettings::default()
+        });
+        workcell
+            .begin(trajectory, false, &Joints::repeat(0.2))
+            .unwrap();
+        while workcell.step(NOW) == Step::Moving {}
+        assert!((workcell.joints_rad() - end).amax() < 1e-12);
+    }
+
+    #[test]
+    fn without_tool_voltage_the_valve_has_no_power() {
+        let (mut workcell, _) = behaving(HardwareSettings {
+            tool_voltage: 0,
+            ..HardwareSettings::default()
+        });
+        workcell.set_io(&set(16, 1.0)).unwrap();
+        assert!(output(&workcell, 16) && !workcell.environment().cell().suction());
+        assert_eq!(workcell.tool_data().tool_output_voltage, 0);
+        let request = SetIORequest {
+            fun: SetIORequest::FUN_SET_TOOL_VOLTAGE,
+            ..set(0, 24.0)
+        };
+        workcell.set_io(&request).unwrap();
+        workcell.set_io(&set(16, 1.0)).unwrap();
+        assert!(workcell.environment().cell().suction());
+        assert_eq!(workcell.tool_data().tool_output_voltage, 24);
     }
 }

@@ -5,7 +5,7 @@ use std::{
     collections::{BTreeMap, VecDeque},
     io,
     sync::{
-        Arc, Mutex, MutexGuard, PoisonError,
+        Arc, Mutex, MutexGuard, OnceLock, PoisonError,
         atomic::{AtomicBool, Ordering},
     },
     thread,
@@ -26,7 +26,7 @@ use ros2_client::{
     builtin_interfaces::Time,
 };
 use rustdds::mio1;
-use tokio::sync::{Mutex as AsyncMutex, mpsc};
+use tokio::sync::{Mutex as AsyncMutex, mpsc, watch};
 use tokio_util::sync::CancellationToken;
 use tracing::{debug, warn};
 
@@ -47,6 +47,9 @@ const WAITING_GOALS: usize = 16;
 const FINISHED_GOALS: usize = 64;
 /// Requests for one goal that are kept for an answer.
 const WAITING_REQUESTS: usize = 64;
+
+/// A server that is not discovered for so long is not there.
+const SERVER_LOST: Duration = Duration::from_secs(2);
 
 type RosServer<A> =
     ros2_client::ActionServer<<A as Action>::Goal, <A as Action>::Result, <A as Action>::Feedback>;
@@ -71,6 +74,13 @@ struct Shared<A: Action + 'static> {
     statistics: Arc<Statistics>,
     stop: AtomicBool,
     table: Mutex<Table<A>>,
+    repeats: OnceLock<Repeats>,
+}
+
+/// What a repeated goal id is answered, and how many have come.
+struct Repeats {
+    accepted: bool,
+    count: watch::Sender<u64>,
 }
 
 struct Table<A: Action + 'static> {
@@ -132,6 +142,7 @@ impl<A: Action + 'static> ActionServer<A> {
                 goals: BTreeMap::new(),
                 finished: VecDeque::new(),
             }),
+            repeats: OnceLock::new(),
         });
         let receiving = Arc::clone(&shared);
         let span = tracing::Span::current();
@@ -168,6 +179,16 @@ impl<A: Action + 'static> ActionServer<A> {
                 None => std::future::pending().await,
             }
         }
+    }
+
+    /// From now on a request with the id of an earlier goal is not taken for a repetition by a client that has missed the answer: it
+    /// is answered with `accepted`, and counted. For servers that emulate rclcpp's, which do not allow it.
+    pub fn count_repeats(&self, accepted: bool) -> watch::Receiver<u64> {
+        let repeats = self.shared.repeats.get_or_init(|| Repeats {
+            accepted,
+            count: watch::channel(0).0,
+        });
+        repeats.count.subscribe()
     }
 
     /// The counters of this action's goals.
@@ -229,6 +250,10 @@ impl<A: Action + 'static> Shared<A> {
         let id = request.goal_id;
         let mut table = self.table();
         if let Some(entry) = table.goals.get_mut(&id) {
+            if let Some(repeats) = self.repeats.get() {
+                repeats.count.send_modify(|count| *count += 1);
+                return self.answer_goal(request_id, repeats.accepted, entry.stamp);
+            }
             // The client asks again because our answer was lost.
             match entry.state {
                 State::New => entry.goal_requests.push(request_id),
@@ -596,13 +621,55 @@ impl<A: Action + 'static> ActionClient<A> {
                 name: self.name.clone(),
             });
         }
-        Ok(SentGoal {
-            id: goal_id,
+        Ok(self.sent(goal_id))
+    }
+
+    /// Sends a goal once and waits for the answer for as long as the server is there: for servers that do not allow the same goal
+    /// twice, as rclcpp's. Where the future is dropped, the answer is lost and the goal may still be accepted.
+    pub async fn send_goal_once(&self, goal: &A::Goal) -> Result<SentGoal<A>, CallError> {
+        let _one_at_a_time = self.goal_call.lock().await;
+        self.wait_for_server(SERVER_LOST).await?;
+        let goal_id = GoalId::new_random();
+        let request = SendGoalRequest {
+            goal_id,
+            goal: goal.clone(),
+        };
+        let answer = self.client.goal_client().async_call_service(request);
+        futures::pin_mut!(answer);
+        let reply = loop {
+            match tokio::time::timeout(SERVER_LOST, answer.as_mut()).await {
+                Ok(Ok(reply)) => break reply,
+                Ok(Err(error)) => {
+                    return Err(CallError::Middleware {
+                        name: self.name.clone(),
+                        reason: error.to_string(),
+                    });
+                }
+                Err(_) if self.graph.has_action(&self.name) => {}
+                Err(_) => {
+                    return Err(CallError::Unavailable {
+                        name: self.name.clone(),
+                        waited: SERVER_LOST,
+                    });
+                }
+            }
+        };
+        if !reply.accepted {
+            return Err(CallError::Rejected {
+                name: self.name.clone(),
+            });
+        }
+        Ok(self.sent(goal_id))
+    }
+
+    fn sent(&self, id: GoalId) -> SentGoal<A> {
+        SentGoal {
+            id,
             client: Arc::clone(&self.client),
             calls: Arc::clone(&self.calls),
             graph: self.graph.clone(),
             name: self.name.clone(),
-        })
+        }
     }
 
     /// Asks the server to cancel all its goals: where the reply to a goal was lost, its state is

@@ -81,9 +81,12 @@ impl ParameterStore {
         }
         for (name, default) in shown(&P::default())? {
             let range = P::RANGES.iter().find(|(ranged, _)| *ranged == name);
-            let access = match P::CHANGEABLE.contains(&name.as_str()) {
-                true => Access::Always,
-                false => Access::Unconfigured,
+            let access = if P::FIXED.contains(&name.as_str()) {
+                Access::Never
+            } else if P::CHANGEABLE.contains(&name.as_str()) {
+                Access::Always
+            } else {
+                Access::Unconfigured
             };
             let declaration = Declaration {
                 description: description(&name, ""),
@@ -471,6 +474,35 @@ mod tests {
         assert!(store.set(&[empty]).is_ok());
         let kind = store.get(&names(&["cameras"]))[0].r#type;
         assert_eq!(kind, ParameterType::PARAMETER_STRING_ARRAY);
+    }
+
+    #[derive(Clone, Debug, Default, PartialEq, Serialize, Deserialize)]
+    #[serde(default, deny_unknown_fields)]
+    struct Guarded {
+        require_approval: bool,
+    }
+
+    impl Parameters for Guarded {
+        const FIXED: &'static [&'static str] = &["require_approval"];
+    }
+
+    #[test]
+    fn what_protects_people_is_fixed_also_before_the_node_is_configured() {
+        let loaded = Loaded {
+            parameters: Guarded {
+                require_approval: true,
+            },
+            use_sim_time: true,
+            autostart: true,
+            qos_overrides: Default::default(),
+        };
+        let store = ParameterStore::new(&loaded, false).unwrap();
+        let refused = store
+            .set(&[parameter("require_approval", false)])
+            .unwrap_err();
+        assert!(refused.contains("restart"), "{refused}");
+        assert!(store.newest::<Guarded>().unwrap().borrow().require_approval);
+        assert!(store.describe(&names(&["require_approval"]))[0].read_only);
     }
 
     #[test]

@@ -24,6 +24,9 @@ pub trait Parameters:
     /// Dotted names of those that may be set while the node is configured; the others are read when it is
     /// configured. The node learns of a change by [`Node::parameters`](crate::Node::parameters).
     const CHANGEABLE: &'static [&'static str] = &[];
+    /// Dotted names of those that nobody sets once the process has started, not even while the node is unconfigured: what protects
+    /// people is not for the network to change.
+    const FIXED: &'static [&'static str] = &[];
 
     /// Checks what types and ranges cannot express: names, combinations.
     fn validate(&self) -> Result<(), InvalidParameter> {
@@ -511,7 +514,8 @@ pub fn mistakes_in_documentation<P: Parameters>(node: &str) -> Vec<String> {
         }
     }
     let ranged = P::RANGES.iter().map(|(name, _)| *name);
-    for name in ranged.chain(P::CHANGEABLE.iter().copied()) {
+    let accessed = P::CHANGEABLE.iter().chain(P::FIXED).copied();
+    for name in ranged.chain(accessed) {
         if !names.iter().any(|known| known == name) {
             mistakes.push(format!("{name} is no parameter of {node}"));
         }

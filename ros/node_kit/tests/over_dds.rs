@@ -192,6 +192,43 @@ fn trajectory(kind: i32) -> FollowJointTrajectoryGoal {
 }
 
 #[tokio::test(flavor = "multi_thread")]
+async fn a_goal_that_is_sent_once_gets_its_late_answer_and_repeats_are_counted_where_asked_for() {
+    let context = Context::new(Network::unused().unwrap());
+    let server_node = node(&context, "server", "");
+    let mut server = server_node
+        .action_server::<FollowJointTrajectory>("controller/follow")
+        .unwrap();
+    let repeats = server.count_repeats(false);
+    let answering = tokio::spawn(async move {
+        for _ in 0..2 {
+            let goal = server.recv().await;
+            tokio::time::sleep(Duration::from_millis(1500)).await;
+            goal.accept()
+                .1
+                .succeed(FollowJointTrajectoryResult::default());
+        }
+        server
+    });
+    let client = node(&context, "client", "")
+        .action_client::<FollowJointTrajectory>("controller/follow")
+        .unwrap();
+    client.wait_for_server(LIMIT).await.unwrap();
+    let sent = timeout(LIMIT, client.send_goal_once(&trajectory(1))).await;
+    let end = timeout(LIMIT, sent.unwrap().unwrap().result()).await;
+    assert_eq!(end.unwrap().unwrap().0, GoalStatus::Succeeded);
+    assert_eq!(*repeats.borrow(), 0);
+    // One that repeats its goal meets a server that does not want that.
+    let impatient = CallOptions {
+        attempts: 3,
+        timeout: Duration::from_millis(400),
+    };
+    let answer = timeout(LIMIT, client.send_goal(&trajectory(1), &impatient)).await;
+    assert!(answer.unwrap().is_err());
+    assert!(*repeats.borrow() >= 1);
+    timeout(LIMIT, answering).await.unwrap().unwrap();
+}
+
+#[tokio::test(flavor = "multi_thread")]
 async fn actions_run_side_by_side_and_end_as_they_should() {
     let context = Context::new(Network::unused().unwrap());
     let server_node = node(&context, "server", "");

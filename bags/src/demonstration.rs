@@ -6,7 +6,9 @@ use msgs::convert::{self, ConvertError};
 use msgs::sctn_msgs;
 use pick_place::{Outcome, PickPlace, PrimitiveSettings};
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
 use std::time::Duration;
+use step_protocol::{GoalSequence, NoGoals, ShownStep, goal_steps, goals_of};
 
 /// One step: what was seen, what was done, what came of it.
 #[derive(Clone, Debug, PartialEq)]
@@ -119,16 +121,10 @@ const DECIDED: Duration = Duration::from_millis(250);
 const OVER: Duration = Duration::from_millis(750);
 
 impl Demonstration {
-    /// The observations after each positive delta reward, in order: what a policy is to reach (v1 to vD in the paper).
+    /// The images that a policy is to reach, in order (v1 to vD in the paper): see [`step_protocol::goal_steps`].
     pub fn goals(&self) -> Vec<&Heightmap> {
-        let reached = self
-            .steps
-            .iter()
-            .enumerate()
-            .filter(|(_, step)| step.delta_reward > 0.0);
-        reached
-            .map(|(index, _)| self.observation(index + 1))
-            .collect()
+        let reached = self.goal_steps().into_iter();
+        reached.map(|index| self.observation(index + 1)).collect()
     }
 
     /// For people: problem, seed of the scene, and that of the start where it is not the scene's own.
@@ -138,6 +134,31 @@ impl Demonstration {
             name += &format!("/{}", self.start_seed);
         }
         name
+    }
+
+    fn goal_steps(&self) -> Vec<usize> {
+        goal_steps(self.steps.iter().map(|step| step.delta_reward))
+    }
+
+    /// The goals for a goal tracker; images are moved, not copied.
+    ///
+    /// # Errors
+    /// No step earned a reward.
+    pub fn into_goals(self) -> Result<GoalSequence, NoGoals> {
+        let name = self.name();
+        let mut after = Arc::new(self.last);
+        let mut steps = Vec::with_capacity(self.steps.len());
+        for step in self.steps.into_iter().rev() {
+            let before = Arc::new(step.observation);
+            steps.push(ShownStep {
+                delta_reward: step.delta_reward,
+                module: step.module,
+                settings: step.settings,
+                after: std::mem::replace(&mut after, before),
+            });
+        }
+        steps.reverse();
+        goals_of(&self.problem, &name, after, &steps)
     }
 
     /// The workspace before step `index`, from 0; after the last step for any larger one.
@@ -181,7 +202,7 @@ impl Demonstration {
             // How many views were fused is not part of a demonstration.
             convert::heightmap_to_msg(self.observation(index).clone(), header, 0, 0.0)
         };
-        let last_reward = self.steps.iter().rposition(|step| step.delta_reward > 0.0);
+        let goal_steps = self.goal_steps();
         let mut total = 0.0;
         for (index, step) in self.steps.iter().enumerate() {
             bag.write(
@@ -192,19 +213,21 @@ impl Demonstration {
             let header = convert::header(time(index), FRAME).map_err(error(PICK_PLACE, index))?;
             let settings = convert::settings_to_msg(&step.settings);
             let number = index as u32 + 1;
-            let rewarded = self.steps[index..]
-                .iter()
-                .position(|step| step.delta_reward > 0.0);
-            if let Some(goal) = rewarded.map(|ahead| index + ahead + 1) {
+            let reached = goal_steps.partition_point(|goal_step| *goal_step < index);
+            if let Some(goal_step) = goal_steps.get(reached) {
+                let before = reached
+                    .checked_sub(1)
+                    .map_or(0, |last| goal_steps[last] + 1);
                 let message = sctn_msgs::Goal {
                     header: header.clone(),
                     problem: self.problem.clone(),
                     demonstration: self.name(),
-                    step: number,
-                    step_count: self.steps.len() as u32,
+                    step: reached as u32 + 1,
+                    step_count: goal_steps.len() as u32,
                     module: step.module.clone(),
                     settings,
-                    heightmap: heightmap(goal).map_err(error(GOAL, index))?,
+                    heightmap: heightmap(goal_step + 1).map_err(error(GOAL, index))?,
+                    previous: heightmap(before).map_err(error(GOAL, index))?,
                     ..Default::default()
                 };
                 bag.write(goals, time(index), &message)?;
@@ -233,7 +256,7 @@ impl Demonstration {
             };
             bag.write(results, over, &result)?;
             total += step.delta_reward;
-            let complete = last_reward == Some(index);
+            let complete = goal_steps.last() == Some(&index);
             bag.write(
                 rewards,
                 over,

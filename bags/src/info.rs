@@ -7,6 +7,7 @@ use serde::Serialize;
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::time::Duration;
+use step_protocol::{OperatorDecision, StepOutcome};
 
 /// A bag at a glance. Reads indices, and of the messages only those that say how the steps went.
 #[derive(Clone, Debug, PartialEq, Serialize)]
@@ -79,29 +80,11 @@ pub struct RunInfo {
 
 /// An outcome of a step in words.
 pub fn outcome_name(outcome: u8) -> &'static str {
-    match outcome {
-        StepResult::PLACED => "placed",
-        StepResult::NO_CONTACT => "no contact",
-        StepResult::GRASP_FAILED => "grasp failed",
-        StepResult::DROPPED => "dropped",
-        StepResult::LAG_ABORTED => "stopped by lag",
-        StepResult::REFUSED => "refused",
-        StepResult::REJECTED => "rejected",
-        StepResult::FAULT => "fault",
-        StepResult::STOPPED => "stopped",
-        _ => "unknown outcome",
-    }
+    StepOutcome::from_code(outcome).map_or("unknown outcome", StepOutcome::name)
 }
 
 fn decision_name(decision: u8) -> &'static str {
-    match decision {
-        StepConfirmation::APPROVE => "approve",
-        StepConfirmation::REJECT => "reject",
-        StepConfirmation::ADVANCE => "advance",
-        StepConfirmation::RETRY => "retry",
-        StepConfirmation::STOP => "stop",
-        _ => "unknown decision",
-    }
+    OperatorDecision::from_code(decision).map_or("unknown decision", OperatorDecision::name)
 }
 
 impl BagInfo {

@@ -12,7 +12,7 @@ use mcap::sans_io::indexed_reader::{
 };
 use mcap::sans_io::linear_reader::LinearReaderOptions;
 use mcap::sans_io::summary_reader::{SummaryReadEvent, SummaryReader, SummaryReaderOptions};
-use msgs::{Interface, from_cdr};
+use msgs::{Interface, from_cdr, from_recorded_cdr};
 use std::collections::BTreeMap;
 use std::ffi::OsStr;
 use std::fs::File;
@@ -98,7 +98,9 @@ impl RawMessage {
                 "cdr",
             ));
         }
-        if !topic.type_hash.is_empty() && topic.type_hash != T::TYPE_HASH {
+        let is_current = topic.type_hash == T::TYPE_HASH;
+        let is_known = is_current || T::EARLIER_TYPE_HASHES.contains(&topic.type_hash.as_str());
+        if !topic.type_hash.is_empty() && !is_known {
             return Err(BagError::Definition {
                 topic: topic.name.clone(),
                 type_name: topic.type_name.clone(),
@@ -106,7 +108,11 @@ impl RawMessage {
                 expected: T::TYPE_HASH.to_owned(),
             });
         }
-        from_cdr(&self.data).map_err(|source| BagError::Message {
+        let message = match is_current {
+            true => from_cdr(&self.data),
+            false => from_recorded_cdr(&self.data),
+        };
+        message.map_err(|source| BagError::Message {
             topic: topic.name.clone(),
             time: self.log_time,
             source,

@@ -11,6 +11,7 @@ use pick_place::Outcome;
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 use std::time::Duration;
+use step_protocol::{ProposalStatus, StepOutcome};
 
 /// A proposal of a run that is no step of its demonstration.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -33,12 +34,10 @@ struct Attempt {
     result: Option<StepResult>,
 }
 
-/// Whether the arm has moved for it.
+/// Whether the arm has moved for it. What a later version may add counts as a motion.
 fn moved(result: &StepResult) -> bool {
-    !matches!(
-        result.outcome,
-        StepResult::REFUSED | StepResult::REJECTED | StepResult::STOPPED
-    )
+    let status = ProposalStatus::from_code(result.proposal_status);
+    StepOutcome::from_code(result.outcome).is_none_or(|outcome| outcome.arm_moved_for(status))
 }
 
 /// The moment of a stamp. Stamps of before the clock's zero count as its zero.

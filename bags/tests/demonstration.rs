@@ -123,14 +123,19 @@ fn the_bag_shows_the_next_goal_of_each_step() {
         .messages_between(&["/goal"], Duration::ZERO, Duration::MAX)
         .map(|message| message.unwrap().decode().unwrap())
         .collect();
-    // The last step leads to no reward and has no goal.
-    let expected = [2, 2, 3].map(|index| demonstration.observation(index));
+    // Number of the goal, the observation that it is, and the one before it. The last step leads to no reward and has no goal.
+    let expected = [(1, 2, 0), (1, 2, 0), (2, 3, 2)];
     assert_eq!(goals.len(), expected.len());
-    for (number, (goal, expected)) in goals.into_iter().zip(expected).enumerate() {
-        assert_eq!((goal.step as usize, goal.step_count), (number + 1, 4));
+    for (goal, (number, image, previous)) in goals.into_iter().zip(expected) {
+        assert_eq!((goal.step, goal.step_count), (number, 2));
+        let observation = |heightmap| msgs::convert::heightmap_from_msg(heightmap).unwrap();
         assert_eq!(
-            &msgs::convert::heightmap_from_msg(goal.heightmap).unwrap(),
-            expected
+            &observation(goal.heightmap),
+            demonstration.observation(image)
+        );
+        assert_eq!(
+            &observation(goal.previous),
+            demonstration.observation(previous)
         );
     }
 }

@@ -58,6 +58,14 @@ pub struct Field {
     pub line: usize,
 }
 
+impl Field {
+    /// Whether recordings from before the field was added are read without it.
+    pub fn is_missing_in_older_recordings(&self) -> bool {
+        let comment = self.comment.join(" ");
+        comment.ends_with("Missing in older recordings.")
+    }
+}
+
 #[derive(Clone, Debug, PartialEq)]
 pub struct Constant {
     pub name: String,

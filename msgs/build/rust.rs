@@ -3,7 +3,7 @@
 use crate::definition::{
     Arity, Constant, Element, Field, Interface, Kind, Literal, Primitive, Structure,
 };
-use crate::type_hash::{type_hash, type_name};
+use crate::type_hash::{earlier_type_hashes, type_hash, type_name};
 use std::collections::{BTreeMap, BTreeSet};
 use std::fmt::Write;
 
@@ -99,6 +99,10 @@ fn structure(out: &mut String, known: &Known, interface: &Interface, part: usize
         if let Some(attribute) = serde_attribute(field) {
             put(out, &format!("#[serde({attribute})]"));
         }
+        if field.is_missing_in_older_recordings() {
+            let default = format!("{name}::default_{}", field.name);
+            put(out, &format!("#[serde(default = {default:?})]"));
+        }
         put(
             out,
             &format!("pub {}: {},", identifier(&field.name), rust_type(field)),
@@ -124,6 +128,18 @@ fn structure(out: &mut String, known: &Known, interface: &Interface, part: usize
         put(out, "structure_needs_at_least_one_member: 0,");
     }
     put(out, "} } }");
+    for field in &structure.fields {
+        if field.is_missing_in_older_recordings() {
+            let (field_name, rust_type) = (&field.name, rust_type(field));
+            let value = default_value(field);
+            put(
+                out,
+                &format!(
+                    "impl {name} {{ fn default_{field_name}() -> {rust_type} {{ {value} }} }}"
+                ),
+            );
+        }
+    }
 
     if !structure.constants.is_empty() {
         put(out, &format!("impl {name} {{"));
@@ -157,6 +173,13 @@ fn structure(out: &mut String, known: &Known, interface: &Interface, part: usize
             type_hash(known, interface, part)
         ),
     );
+    let earlier = earlier_type_hashes(known, interface, part);
+    if !earlier.is_empty() {
+        put(
+            out,
+            &format!("const EARLIER_TYPE_HASHES: &'static [&'static str] = &{earlier:?};"),
+        );
+    }
     put(
         out,
         &format!(

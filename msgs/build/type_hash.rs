@@ -30,6 +30,25 @@ pub fn type_hash(
     hash
 }
 
+/// Hashes of the structure as it was before its last fields were added: one for every number of them that may be missing.
+pub fn earlier_type_hashes(
+    known: &BTreeMap<(String, String), Interface>,
+    interface: &Interface,
+    part: usize,
+) -> Vec<String> {
+    let mut earlier = interface.clone();
+    let mut hashes = Vec::new();
+    let is_new = |structure: &Structure| {
+        let last = structure.fields.last();
+        last.is_some_and(Field::is_missing_in_older_recordings)
+    };
+    while is_new(&earlier.parts[part]) {
+        earlier.parts[part].fields.pop();
+        hashes.push(type_hash(known, &earlier, part));
+    }
+    hashes
+}
+
 /// `package/msg/Name`, `package/srv/Name_Request` and so on.
 pub fn type_name(interface: &Interface, part: usize) -> String {
     let kind = interface.kind;

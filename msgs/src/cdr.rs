@@ -42,12 +42,36 @@ pub fn to_cdr_in<T: Serialize>(message: &T, bytes: &mut Vec<u8>) -> Result<(), C
 
 /// A message from CDR of either byte order, with header.
 pub fn from_cdr<T: DeserializeOwned>(bytes: &[u8]) -> Result<T, CdrError> {
+    read::<T>(
+        bytes,
+        |body| cdr_encoding::from_bytes::<T, BigEndian>(body),
+        |body| cdr_encoding::from_bytes::<T, LittleEndian>(body),
+    )
+}
+
+/// A recorded message, which may be from before fields were added at the end of its type: these get their default values.
+/// Only whole fields may be missing, and only those that the type's file marks.
+pub fn from_recorded_cdr<T: DeserializeOwned>(bytes: &[u8]) -> Result<T, CdrError> {
+    read::<T>(
+        bytes,
+        recorded::from_bytes::<T, BigEndian>,
+        recorded::from_bytes::<T, LittleEndian>,
+    )
+}
+
+type Read<T> = cdr_encoding::Result<(T, usize)>;
+
+fn read<T>(
+    bytes: &[u8],
+    big_endian: impl FnOnce(&[u8]) -> Read<T>,
+    little_endian: impl FnOnce(&[u8]) -> Read<T>,
+) -> Result<T, CdrError> {
     let Some((header, body)) = bytes.split_first_chunk::<4>() else {
         return Err(CdrError::NoHeader(bytes.len()));
     };
     let read = match u16::from_be_bytes([header[0], header[1]]) {
-        0 => cdr_encoding::from_bytes::<T, BigEndian>(body),
-        1 => cdr_encoding::from_bytes::<T, LittleEndian>(body),
+        0 => big_endian(body),
+        1 => little_endian(body),
         other => return Err(CdrError::Representation(other)),
     };
     let (message, used) = read.map_err(|error| CdrError::Invalid(error.to_string()))?;
@@ -59,4 +83,69 @@ pub fn from_cdr<T: DeserializeOwned>(bytes: &[u8]) -> Result<T, CdrError> {
         });
     }
     Ok(message)
+}
+
+/// Reads structures that may end before their last fields.
+mod recorded {
+    use super::{MAX_PADDING, Read};
+    use byteorder::ByteOrder;
+    use cdr_encoding::{CdrDeserializer, Error, Result};
+    use serde::de::Error as _;
+    use serde::de::{DeserializeOwned, DeserializeSeed, Deserializer, SeqAccess, Visitor};
+
+    pub(super) fn from_bytes<T: DeserializeOwned, BO: ByteOrder>(bytes: &[u8]) -> Read<T> {
+        let mut fields = Fields {
+            inner: CdrDeserializer::<BO>::new(bytes),
+            bytes,
+        };
+        let message = T::deserialize(&mut fields)?;
+        Ok((message, fields.inner.bytes_consumed()))
+    }
+
+    struct Fields<'de, BO> {
+        inner: CdrDeserializer<'de, BO>,
+        bytes: &'de [u8],
+    }
+
+    impl<'de, BO: ByteOrder> Deserializer<'de> for &mut Fields<'de, BO> {
+        type Error = Error;
+
+        fn deserialize_struct<V: Visitor<'de>>(
+            self,
+            _: &'static str,
+            _: &'static [&'static str],
+            visitor: V,
+        ) -> Result<V::Value> {
+            visitor.visit_seq(self)
+        }
+
+        fn deserialize_any<V: Visitor<'de>>(self, _: V) -> Result<V::Value> {
+            Err(Error::custom("expected a structure"))
+        }
+
+        serde::forward_to_deserialize_any! {
+            bool i8 i16 i32 i64 u8 u16 u32 u64 f32 f64 char str string bytes byte_buf option unit
+            unit_struct newtype_struct seq tuple tuple_struct map enum identifier ignored_any
+        }
+    }
+
+    impl<'de, BO: ByteOrder> SeqAccess<'de> for Fields<'de, BO> {
+        type Error = Error;
+
+        /// None where the bytes end before the field: the structure takes a default, or says what is missing.
+        fn next_element_seed<S: DeserializeSeed<'de>>(
+            &mut self,
+            seed: S,
+        ) -> Result<Option<S::Value>> {
+            let left = &self.bytes[self.inner.bytes_consumed().min(self.bytes.len())..];
+            if left.is_empty() {
+                return Ok(None);
+            }
+            let is_padding = left.len() <= MAX_PADDING && left.iter().all(|byte| *byte == 0);
+            match seed.deserialize(&mut self.inner) {
+                Err(_) if is_padding => Ok(None),
+                read => read.map(Some),
+            }
+        }
+    }
 }

@@ -14,6 +14,8 @@ pub trait Interface:
     const DEFINITION: &'static str;
     /// RIHS01 hash of the type (REP-2016).
     const TYPE_HASH: &'static str;
+    /// Hashes of the type before fields were added at its end: recordings of these are read with defaults in their place.
+    const EARLIER_TYPE_HASHES: &'static [&'static str] = &[];
 }
 
 /// A service.

@@ -14,7 +14,7 @@ mod interfaces {
     include!(concat!(env!("OUT_DIR"), "/interfaces.rs"));
 }
 
-pub use cdr::{CdrError, from_cdr, to_cdr, to_cdr_in};
+pub use cdr::{CdrError, from_cdr, from_recorded_cdr, to_cdr, to_cdr_in};
 pub use interface::{
     Action, Description, Interface, Service, Visitor, description, message_type_name,
 };

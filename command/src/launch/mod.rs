@@ -7,22 +7,27 @@ mod recording;
 use crate::demos::demonstration;
 use crate::root::Root;
 use anyhow::{Context as _, Result, bail};
-use bags::{Demonstration, outcome_name};
+use bags::Demonstration;
 use clap::Args;
 use graph::{Graph, Settings};
 use heightmap::Heightmap;
-use msgs::convert::heightmap_from_msg;
-use msgs::sctn_msgs::{Goal, PickPlace, Reward, StepConfirmation, StepResult};
+use msgs::convert::{self, heightmap_from_msg};
+use msgs::sctn_msgs::{ConfirmationRefused, Goal, PickPlace, Reward, StepConfirmation, StepResult};
 use multiravens::{Environment, EpisodeSeed};
 use node_kit::{Node, Qos, ns_from_stamp, plain_node, wait_for_end};
-use operator::{Operator, OperatorKind, Question, automatic};
+use operator::OperatorKind;
 use recording::{LAST_HEIGHTMAP, LAST_WORDS, RunRecorder};
 use serde::Serialize;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
+use step_protocol::{
+    Confirmation, Operator, OperatorDecision, Proposal, ProposalId, Question, StepOutcome,
+};
 
 /// With nothing heard for so long, something is broken. Wall time: it decides no outcome, only when to give up.
 const PATIENCE: Duration = Duration::from_secs(60);
+/// With no step going on for so long, a message may have been lost: the automatic operator repeats what it said.
+const SILENCE: Duration = Duration::from_secs(25);
 /// Refusals of an approval in a row after which the operator gives up.
 const MAX_REFUSALS: u32 = 5;
 
@@ -294,11 +299,14 @@ struct Desk {
     goals_reached: bool,
     proposals: node_kit::Subscription<PickPlace>,
     results: node_kit::Subscription<StepResult>,
+    refused: node_kit::Subscription<ConfirmationRefused>,
     rewards: node_kit::Subscription<Reward>,
     goals: node_kit::Subscription<Goal>,
     heightmaps: node_kit::Subscription<msgs::sctn_msgs::Heightmap>,
     confirmations: node_kit::Publisher<StepConfirmation>,
     operator: Operator,
+    /// The motion that was asked about last.
+    confirmed: Option<ProposalId>,
     step_count: u32,
     step_started: Instant,
     refusals: u32,
@@ -319,11 +327,13 @@ impl Desk {
             goals_reached: false,
             proposals: node.subscription("pick_place", Qos::Latched)?,
             results: node.subscription(results, Qos::Event)?,
+            refused: node.subscription("confirmation_refused", Qos::Event)?,
             rewards: node.subscription("reward", Qos::Event)?,
             goals: node.subscription("goal", Qos::Latched)?,
             heightmaps: node.subscription("heightmap", Qos::Latched)?,
             confirmations: node.publisher("step_confirmation", Qos::Event)?,
-            operator: Operator::default(),
+            operator: Operator::new(true),
+            confirmed: None,
             step_count: 0,
             step_started: Instant::now(),
             refusals: 0,
@@ -349,30 +359,50 @@ impl Desk {
         let web = kind == OperatorKind::Web;
         // A person has the last word on the last step too.
         let done = |desk: &Self| desk.complete && (!web || !desk.confirms || desk.goals_reached);
+        let mut heard = Instant::now();
         while !done(self) && (self.steps < max_steps || !alone) {
-            let question = tokio::select! {
-                proposal = self.proposals.recv() => self.operator.proposal(proposal),
-                result = self.results.recv() => self.result(kind, result)?,
-                reward = self.rewards.recv() => {
-                    self.total_reward = reward.total;
-                    self.measured_ns = ns_from_stamp(&reward.header.stamp);
-                    self.operator.reward(reward)
-                }
+            let silence = tokio::time::sleep_until((heard + SILENCE).into());
+            let mut questions = Vec::new();
+            tokio::select! {
+                message = self.proposals.recv() => match convert::proposal_from_msg(&message) {
+                    Ok(proposal) => questions.extend(self.operator.on_proposal(proposal)),
+                    Err(error) => self.proposals.reject(error),
+                },
+                message = self.results.recv() => questions.extend(self.result(kind, &message)?),
+                message = self.rewards.recv() => match convert::reward_from_msg(&message) {
+                    Ok(reward) => {
+                        self.total_reward = reward.total;
+                        self.measured_ns = ns_from_stamp(&message.header.stamp);
+                        questions.extend(self.operator.on_reward(reward));
+                    }
+                    Err(error) => self.rewards.reject(error),
+                },
                 goal = self.goals.recv() => {
                     self.step_count = goal.step_count;
                     self.goals_reached = goal.complete;
-                    None
+                    match convert::goal_from_msg(goal) {
+                        Ok(goal) => self.operator.on_goal(&goal),
+                        Err(error) => self.goals.reject(error),
+                    }
+                }
+                refused = self.refused.recv() => {
+                    tracing::warn!("confirmation of {} refused: {}", refused.proposal_id, refused.message);
                 }
                 heightmap = self.heightmaps.recv() => {
                     self.last_heightmap = Some(heightmap);
-                    None
+                    continue;
                 }
                 () = tokio::time::sleep(LAST_RESULT), if self.goals_reached && !self.confirms => break,
+                () = silence, if kind == OperatorKind::Auto => {
+                    questions = self.operator.on_silence();
+                    tracing::warn!("no step has gone on for {} s: what was said last is repeated", SILENCE.as_secs());
+                }
                 () = tokio::time::sleep(PATIENCE), if alone => {
                     bail!("nothing heard for {} s; no node said why: see the logs", PATIENCE.as_secs());
                 }
-            };
-            if let Some(question) = question {
+            }
+            heard = Instant::now();
+            for question in questions {
                 self.answer(kind, question).await?;
             }
         }
@@ -384,15 +414,22 @@ impl Desk {
         Ok(())
     }
 
-    fn result(&mut self, kind: OperatorKind, result: StepResult) -> Result<Option<Question>> {
+    fn result(&mut self, kind: OperatorKind, message: &StepResult) -> Result<Option<Question>> {
+        let result = match convert::result_from_msg(message) {
+            Ok(result) => result,
+            Err(error) => {
+                self.results.reject(error);
+                return Ok(None);
+            }
+        };
         if kind == OperatorKind::Web {
             // The person sees faults and refusals, and decides how to go on.
-            return Ok(self.operator.result(result));
+            return Ok(self.operator.on_result(result));
         }
-        if result.outcome == StepResult::FAULT {
+        if result.outcome == StepOutcome::Fault {
             bail!("the robot failed: {}", result.reason);
         }
-        if result.outcome == StepResult::REFUSED {
+        if result.outcome == StepOutcome::Refused {
             tracing::warn!("proposal {} refused: {}", result.proposal_id, result.reason);
             self.refusals += 1;
             if self.refusals >= MAX_REFUSALS {
@@ -402,67 +439,65 @@ impl Desk {
                 );
             }
         }
-        Ok(self.operator.result(result))
+        Ok(self.operator.on_result(result))
     }
 
     async fn answer(&mut self, kind: OperatorKind, question: Question) -> Result<()> {
-        let proposal_id = match &question {
+        match &question {
             Question::Approve(proposal) => {
                 self.step_started = Instant::now();
                 self.describe(proposal);
-                proposal.id
             }
-            Question::Confirm(result, reward) => {
-                self.steps += 1;
-                self.complete = reward.complete;
+            Question::Confirm { result, reward, .. } => {
+                // The same motion may be asked about again: see `Operator::on_silence`.
+                if self.confirmed.replace(result.proposal_id) != Some(result.proposal_id) {
+                    self.steps += 1;
+                }
+                self.complete = reward.is_some_and(|reward| reward.complete);
                 self.refusals = 0;
+                let (delta, total) =
+                    reward.map_or((f64::NAN, f64::NAN), |reward| (reward.delta, reward.total));
                 println!(
-                    "    {}, delta reward {:+.3}, reward {:.3}, {:.1} s",
-                    outcome_name(result.outcome),
-                    reward.delta,
-                    reward.total,
+                    "    {}, delta reward {delta:+.3}, reward {total:.3}, {:.1} s",
+                    result.outcome.name(),
                     self.step_started.elapsed().as_secs_f64()
                 );
-                result.proposal_id
             }
-        };
+        }
         let decision = match kind {
             OperatorKind::None | OperatorKind::Watch | OperatorKind::Web => return Ok(()),
-            _ if !self.confirms && matches!(question, Question::Confirm(..)) => return Ok(()),
-            OperatorKind::Auto => automatic(&question),
+            _ if !self.confirms && matches!(question, Question::Confirm { .. }) => return Ok(()),
+            OperatorKind::Auto => question.automatic_answer(),
             OperatorKind::Terminal => {
                 let ask = question.clone();
                 self.node.spawn_blocking(move || terminal(&ask)).await??
             }
         };
-        let mut confirmation = StepConfirmation {
-            proposal_id,
+        let confirmation = Confirmation {
+            stamp: Duration::from_nanos(self.node.clock().now_ns().max(0) as u64),
+            proposal_id: question.proposal_id(),
             decision,
             operator_name: "sctn launch".into(),
-            ..Default::default()
         };
-        confirmation.header.stamp = self.node.now();
-        self.confirmations.publish(confirmation);
+        let message = convert::confirmation_to_msg(&confirmation);
+        self.confirmations
+            .publish(message.context("step_confirmation")?);
         Ok(())
     }
 
-    fn describe(&self, proposal: &PickPlace) {
-        let PickPlace {
-            step,
-            attempt,
-            pick,
-            place,
-            ..
-        } = proposal;
+    fn describe(&self, proposal: &Proposal) {
+        let (pick, place) = (&proposal.action.pick, &proposal.action.place);
         println!(
-            "step {step}/{} attempt {attempt}: {} pick ({:.3}, {:.3}) place ({:.3}, {:.3}, {:.0} deg), scores {:.2} {:.2}",
+            "step {}/{} attempt {}: {} pick ({:.3}, {:.3}) place ({:.3}, {:.3}, {:.0} deg), scores {:.2} {:.2}",
+            proposal.step,
             self.step_count,
+            proposal.attempt,
             proposal.module,
-            pick.x,
-            pick.y,
-            place.x,
-            place.y,
-            place.theta.to_degrees(),
+            pick.translation.x,
+            pick.translation.y,
+            place.translation.x,
+            place.translation.y,
+            place.rotation.angle().to_degrees(),
             proposal.pick_score,
             proposal.place_score
         );
@@ -486,23 +521,24 @@ impl Desk {
 }
 
 /// Asks the person at the terminal.
-fn terminal(question: &Question) -> Result<u8> {
+fn terminal(question: &Question) -> Result<OperatorDecision> {
     use std::io::Write;
-    let (text, answers): (&str, &[(&str, u8)]) = match question {
+    let (text, answers): (&str, &[(&str, OperatorDecision)]) = match question {
         Question::Approve(_) => (
             "carry it out? [y]es, [n]o, [s]top",
             &[
-                ("y", StepConfirmation::APPROVE),
-                ("n", StepConfirmation::REJECT),
-                ("s", StepConfirmation::STOP),
+                ("y", OperatorDecision::Approve),
+                ("n", OperatorDecision::Reject),
+                ("s", OperatorDecision::Stop),
             ],
         ),
-        Question::Confirm(..) => (
-            "did the step succeed? [y]es, [n]o: try again, [s]top",
+        Question::Confirm { .. } => (
+            "did the step succeed? [y]es, [n]o: try again, it undid an earlier step: go [b]ack, [s]top",
             &[
-                ("y", StepConfirmation::ADVANCE),
-                ("n", StepConfirmation::RETRY),
-                ("s", StepConfirmation::STOP),
+                ("y", OperatorDecision::Advance),
+                ("n", OperatorDecision::Retry),
+                ("b", OperatorDecision::StepBack),
+                ("s", OperatorDecision::Stop),
             ],
         ),
     };

@@ -6,7 +6,9 @@ use bag_transport::{RECORDED_SUFFIX, Recorder, RecorderOptions, Recording};
 use bags::Qos;
 use msgs::Interface;
 use msgs::rosgraph_msgs::Clock;
-use msgs::sctn_msgs::{Goal, Heightmap, PickPlace, Reward, StepConfirmation, StepResult};
+use msgs::sctn_msgs::{
+    ConfirmationRefused, Goal, Heightmap, PickPlace, Reward, StepConfirmation, StepResult,
+};
 use msgs::sensor_msgs::{CameraInfo, Image, JointState};
 use msgs::tf2_msgs::TFMessage;
 use node_kit::plain_node;
@@ -22,7 +24,7 @@ const DISCOVERY: Duration = Duration::from_secs(20);
 /// How long what shows the end of the run may take: images are best effort, and said again twice a second.
 pub const LAST_HEIGHTMAP: Duration = Duration::from_secs(20);
 
-const TOPICS: [(&str, &str, Qos); 9] = [
+const TOPICS: [(&str, &str, Qos); 10] = [
     ("heightmap", Heightmap::TYPE_NAME, Qos::LATCHED),
     ("goal", Goal::TYPE_NAME, Qos::LATCHED),
     ("pick_place", PickPlace::TYPE_NAME, Qos::LATCHED),
@@ -32,6 +34,11 @@ const TOPICS: [(&str, &str, Qos); 9] = [
         Qos::RELIABLE,
     ),
     ("step_result", StepResult::TYPE_NAME, Qos::RELIABLE),
+    (
+        "confirmation_refused",
+        ConfirmationRefused::TYPE_NAME,
+        Qos::RELIABLE,
+    ),
     ("reward", Reward::TYPE_NAME, Qos::RELIABLE),
     ("joint_states", JointState::TYPE_NAME, Qos::RELIABLE),
     ("/tf_static", TFMessage::TYPE_NAME, Qos::LATCHED),

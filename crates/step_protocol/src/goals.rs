@@ -7,7 +7,7 @@ use heightmap::{Disk, Heightmap};
 use nalgebra::Isometry2;
 use pick_place::{Outcome, PrimitiveSettings};
 
-use crate::{Goal, OperatorDecision, StepOutcome};
+use crate::{Coverage, Goal, OperatorDecision, StepOutcome};
 
 /// A step of a demonstration, as far as its goals depend on it.
 #[derive(Clone, Debug, PartialEq)]
@@ -47,13 +47,14 @@ pub fn goal_steps(delta_rewards: impl IntoIterator<Item = f64>) -> Vec<usize> {
     rewarded.map(|(index, _)| index).collect()
 }
 
-/// The goals of a demonstration from `start`: what was seen after each step with a positive delta reward.
+/// The goals of a demonstration from `start`: what was seen after each step with a positive delta reward. `demonstration` is its
+/// name for people.
 ///
 /// # Errors
 /// No step earned a reward.
 pub fn goals_of(
     problem: &str,
-    seed: u64,
+    demonstration: &str,
     start: Arc<Heightmap>,
     steps: &[ShownStep],
 ) -> Result<GoalSequence, NoGoals> {
@@ -70,7 +71,7 @@ pub fn goals_of(
         Goal {
             stamp: Duration::ZERO,
             problem: problem.to_owned(),
-            demonstration: format!("{problem}/{seed}"),
+            demonstration: demonstration.to_owned(),
             step: number as u32 + 1,
             step_count,
             attempt: 0,
@@ -79,6 +80,7 @@ pub fn goals_of(
             settings: step.settings,
             previous: Some(std::mem::replace(&mut previous, Arc::clone(&step.after))),
             image: Arc::clone(&step.after),
+            coverage: Coverage::default(),
         }
     };
     Ok(GoalSequence {
@@ -244,7 +246,7 @@ mod tests {
     #[test]
     fn goals_are_the_images_after_a_reward_each_with_the_one_before() {
         let steps = [step(0.5, 1), step(0.0, 2), step(-0.5, 3), step(0.5, 4)];
-        let sequence = goals_of("placing", 7, image(0), &steps).unwrap();
+        let sequence = goals_of("placing", "placing/7", image(0), &steps).unwrap();
         let marks = |goal: &Goal| (goal.previous.as_ref().unwrap().rgb[0], goal.image.rgb[0]);
         let found: Vec<_> = sequence.goals.iter().map(marks).collect();
         assert_eq!(found, [(0, 1), (1, 4)]);
@@ -255,7 +257,7 @@ mod tests {
             ("placing/7", "module 4")
         );
         assert_eq!(sequence.start.unwrap().rgb[0], 0);
-        let error = goals_of("placing", 7, image(0), &steps[1..3]).unwrap_err();
+        let error = goals_of("placing", "placing/7", image(0), &steps[1..3]).unwrap_err();
         assert!(
             error.to_string().contains("no step with a reward"),
             "{error}"

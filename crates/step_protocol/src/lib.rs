@@ -28,6 +28,6 @@ pub use tracker::{
     Capture, CaptureError, Change, ConfirmationRefusal, GoalTracker, NoSuchStep, StepJudge,
 };
 pub use types::{
-    Confirmation, Goal, Observation, OperatorDecision, Proposal, ProposalId, ProposalStatus,
-    Reward, StepOutcome, StepResult, yaw_rad,
+    Confirmation, Coverage, Goal, Observation, OperatorDecision, Proposal, ProposalId,
+    ProposalStatus, Reward, StepOutcome, StepResult, yaw_rad,
 };

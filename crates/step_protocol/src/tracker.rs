@@ -9,7 +9,7 @@ use pick_place::PrimitiveSettings;
 
 use crate::mutation::{Mutation, planted};
 use crate::{
-    Confirmation, Goal, GoalSequence, Judgement, OperatorDecision, Proposal, ProposalId,
+    Confirmation, Coverage, Goal, GoalSequence, Judgement, OperatorDecision, Proposal, ProposalId,
     ProposalStatus, StepOutcome, StepResult,
 };
 
@@ -106,6 +106,8 @@ pub enum CaptureError {
 pub struct Capture {
     /// What was seen.
     pub image: Arc<Heightmap>,
+    /// How much of it was seen.
+    pub coverage: Coverage,
     /// At the end of the sequence; else before the present goal.
     pub append: bool,
     /// Task module; empty for that of the goal beside it.
@@ -288,6 +290,7 @@ impl GoalTracker {
             },
             settings: settings.ok_or(CaptureError::NoSettings)?,
             image: capture.image,
+            coverage: capture.coverage,
             previous: None,
         };
         let index = if capture.append {

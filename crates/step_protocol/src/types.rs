@@ -224,6 +224,15 @@ impl fmt::Display for ProposalStatus {
     }
 }
 
+/// How much of the workspace the cameras saw; all 0 where that is not known.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Coverage {
+    /// Number of views fused.
+    pub views: u32,
+    /// Fraction of the cells that some view saw, 0 to 1.
+    pub fraction: f32,
+}
+
 /// A heightmap and when it was seen.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Observation {
@@ -233,6 +242,8 @@ pub struct Observation {
     pub frame: String,
     /// What was seen.
     pub heightmap: Arc<Heightmap>,
+    /// How much of it was seen.
+    pub coverage: Coverage,
 }
 
 /// What is to be reached next: an image of a demonstration.
@@ -258,6 +269,8 @@ pub struct Goal {
     pub settings: PrimitiveSettings,
     /// The workspace after this step, v_k.
     pub image: Arc<Heightmap>,
+    /// How much of `image` was seen.
+    pub coverage: Coverage,
     /// The workspace before this step in the demonstration, v_(k-1); v_0 is what was seen before the first step. None where
     /// a taught sequence has no image of its start.
     pub previous: Option<Arc<Heightmap>>,

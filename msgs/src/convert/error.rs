@@ -24,6 +24,12 @@ pub enum ConvertError {
         actual: String,
         expected: String,
     },
+    /// A part of the message.
+    #[error("{field}.{source}")]
+    Part {
+        field: &'static str,
+        source: Box<ConvertError>,
+    },
     /// Points that make no trajectory.
     #[error("trajectory points: {0}")]
     Trajectory(Box<ur5::PlanError>),

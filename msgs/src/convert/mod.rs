@@ -8,6 +8,7 @@ mod error;
 mod heightmap;
 mod motion;
 mod preview;
+mod step;
 mod time;
 
 pub use camera::{
@@ -22,4 +23,9 @@ pub use motion::{
     pick_place_from_msg, pose2d_from_msg, pose2d_to_msg, settings_from_msg, settings_to_msg,
 };
 pub use preview::{compressed_preview, grid_map, points, preview_image};
+pub use step::{
+    confirmation_from_msg, confirmation_refused_to_msg, confirmation_to_msg, goal_from_msg,
+    goal_to_msg, observation_from_msg, proposal_from_msg, proposal_to_msg, result_from_msg,
+    result_to_msg, reward_from_msg,
+};
 pub use time::{duration_from_msg, duration_to_msg, time_from_msg, time_to_msg};

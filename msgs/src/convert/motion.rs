@@ -4,9 +4,9 @@ use super::error::{all_finite, finite, positive, size, unexpected};
 use super::{ConvertError, duration_from_msg, duration_to_msg};
 use crate::{geometry_msgs, sctn_msgs, sensor_msgs, std_msgs, trajectory_msgs};
 use ::pick_place::{Outcome, Phase, PickPlace, PrimitiveSettings};
-use nalgebra::{Isometry2, Isometry3, Quaternion, Translation3, Unit, UnitComplex, UnitQuaternion};
-use std::f64::consts::{PI, TAU};
-use std::iter::successors;
+use nalgebra::{Isometry2, Isometry3, Quaternion, Translation3, Unit, UnitQuaternion};
+use std::f64::consts::TAU;
+use step_protocol::StepOutcome;
 use ur5::{JointTrajectory, Joints, TrajectoryPoint};
 
 /// A pose in the plane with finite position and a yaw of at most one turn.
@@ -25,34 +25,21 @@ pub fn pose2d_to_msg(pose: &Isometry2<f64>) -> geometry_msgs::Pose2D {
     geometry_msgs::Pose2D {
         x: pose.translation.x,
         y: pose.translation.y,
-        theta: yaw_rad(&pose.rotation),
+        theta: step_protocol::yaw_rad(&pose.rotation),
     }
-}
-
-/// The angle of a rotation; among its neighbours the one whose sine and cosine are exactly the rotation's.
-fn yaw_rad(rotation: &UnitComplex<f64>) -> f64 {
-    let angle = rotation.angle();
-    let turned = if angle < 0.0 {
-        angle + TAU
-    } else {
-        angle - TAU
-    };
-    for near in [angle, turned] {
-        let up = successors(Some(near), |yaw| Some(yaw.next_up()));
-        let down = successors(Some(near), |yaw| Some(yaw.next_down()));
-        let exact = |yaw: &f64| yaw.abs() <= TAU && UnitComplex::new(*yaw) == *rotation;
-        if let Some(yaw) = up.take(5).chain(down.take(5)).find(exact) {
-            return yaw;
-        }
-    }
-    angle.clamp(-PI, PI)
 }
 
 /// The poses of a proposal.
 pub fn pick_place_from_msg(msg: &sctn_msgs::PickPlace) -> Result<PickPlace, ConvertError> {
+    let pose = |field, pose| {
+        pose2d_from_msg(pose).map_err(|source| ConvertError::Part {
+            field,
+            source: Box::new(source),
+        })
+    };
     Ok(PickPlace {
-        pick: pose2d_from_msg(&msg.pick)?,
-        place: pose2d_from_msg(&msg.place)?,
+        pick: pose("pick", &msg.pick)?,
+        place: pose("place", &msg.place)?,
     })
 }
 
@@ -84,14 +71,7 @@ pub fn settings_to_msg(settings: &PrimitiveSettings) -> sctn_msgs::PrimitiveSett
 
 /// A constant of `StepResult`.
 pub fn outcome_to_msg(outcome: Outcome) -> u8 {
-    use sctn_msgs::StepResult;
-    match outcome {
-        Outcome::Placed => StepResult::PLACED,
-        Outcome::NoContact => StepResult::NO_CONTACT,
-        Outcome::GraspFailed => StepResult::GRASP_FAILED,
-        Outcome::Dropped => StepResult::DROPPED,
-        Outcome::LagAborted => StepResult::LAG_ABORTED,
-    }
+    StepOutcome::from(outcome).code()
 }
 
 /// A constant of the feedback of `ExecutePickPlace`.
@@ -113,15 +93,8 @@ pub fn phase_to_msg(phase: Phase) -> u8 {
 
 /// The outcome of a motion that was carried out; refused, rejected and failed ones have none.
 pub fn outcome_from_msg(outcome: u8) -> Result<Outcome, ConvertError> {
-    use sctn_msgs::StepResult;
-    Ok(match outcome {
-        StepResult::PLACED => Outcome::Placed,
-        StepResult::NO_CONTACT => Outcome::NoContact,
-        StepResult::GRASP_FAILED => Outcome::GraspFailed,
-        StepResult::DROPPED => Outcome::Dropped,
-        StepResult::LAG_ABORTED => Outcome::LagAborted,
-        other => return Err(unexpected("outcome", other, "that of a motion, 1 to 5")),
-    })
+    let motion = StepOutcome::from_code(outcome).and_then(StepOutcome::motion);
+    motion.ok_or_else(|| unexpected("outcome", outcome, "that of a motion, 1 to 5"))
 }
 
 /// How far the norm of a quaternion may be from 1, as tf2 has it.

@@ -1,11 +1,10 @@
 //! Node that proposes pick and place poses.
 //!
-//! When to propose is decided in [`Proposer`], which knows no ROS node; the network runs on a thread of
+//! When to propose is decided in [`ProposalPlanner`], which knows no ROS node; the network runs on a thread of
 //! its own.
 
 mod parameters;
 mod picture;
-mod proposer;
 
 use std::{
     sync::{Arc, Mutex, PoisonError},
@@ -15,17 +14,19 @@ use std::{
 use anyhow::{Context as _, bail};
 use gctn::{Decision, GoalConditioning, Policy};
 use msgs::{
+    convert,
     sctn_msgs::{Goal, Heightmap, PickPlace, StepConfirmation, StepResult},
     sensor_msgs::Image,
     visualization_msgs::MarkerArray,
 };
+use nalgebra::Isometry2;
 use node_kit::{Active, Level, Node, Publisher, Qos};
+use step_protocol::{Job, PlannerRules, Prediction, Proposal, ProposalPlanner};
 use tokio::sync::mpsc;
 use tracing::{info, warn};
 
 pub use parameters::GctnPolicyParameters;
 pub use picture::{markers, score_image};
-pub use proposer::{ChangeRule, Job, Proposer};
 
 /// What the network says to a job, and how long it took.
 struct Answer {
@@ -34,12 +35,12 @@ struct Answer {
     took: Duration,
 }
 
-/// Loads the checkpoint; what it returns proposes.
+/// Loads the checkpoint; returns the node that proposes.
 pub async fn configure(node: Node, parameters: GctnPolicyParameters) -> anyhow::Result<PolicyNode> {
     let path = parameters.checkpoint()?.to_owned();
     let outputs = Outputs {
         node: node.clone(),
-        said: None,
+        last_proposal: None,
         proposals: node.publisher("pick_place", Qos::Latched)?,
         markers: node.publisher("pick_place/markers", Qos::Latched)?,
         scores: node.publisher("pick_place/scores", Qos::Latched)?,
@@ -56,10 +57,13 @@ pub async fn configure(node: Node, parameters: GctnPolicyParameters) -> anyhow::
         .context("loading the checkpoint")?
         .context("parameter checkpoint")?;
     let conditioning = policy.config().conditioning;
-    if conditioning != GoalConditioning::NextStep {
+    if !matches!(
+        conditioning,
+        GoalConditioning::NextStep | GoalConditioning::Sequence
+    ) {
         bail!(
             "parameter checkpoint: {shown} is conditioned on {conditioning:?}, but the goals of the graph are next-step goals: \
-             expected a checkpoint trained with conditioning next_step"
+             expected a checkpoint trained with conditioning next_step or sequence"
         );
     }
     info!("checkpoint {shown} loaded");
@@ -83,41 +87,69 @@ impl Active for PolicyNode {
         let mut results = node.subscription::<StepResult>("step_result", Qos::Event)?;
         let mut goals = node.subscription::<Goal>("goal", Qos::Latched)?;
         let mut heightmaps = node.subscription::<Heightmap>("heightmap", Qos::Latched)?;
-        // One job at a time: the proposer gives the next when it has the answer.
+        // One job at a time: the planner gives the next when it has the answer.
         let (jobs, mut answers) = start_network(node, Arc::clone(&self.policy));
         let mut changes = node.parameters::<GctnPolicyParameters>();
-        let mut proposer = Proposer::new(change_rule(&changes.borrow_and_update()));
+        let rules = rules_of(&changes.borrow_and_update(), node);
+        let mut planner = ProposalPlanner::new(rules);
         loop {
             let job = tokio::select! {
-                heightmap = heightmaps.recv() => proposer.observed(heightmap).unwrap_or_else(|error| {
-                    heightmaps.reject(error);
-                    None
-                }),
-                goal = goals.recv() => proposer.wanted(goal).unwrap_or_else(|error| {
-                    goals.reject(error);
-                    None
-                }),
-                confirmation = confirmations.recv() => {
-                    proposer.confirmed(&confirmation);
-                    None
-                }
-                result = results.recv() => {
-                    if proposer.is_overlooked(&result) {
-                        self.outputs.say_again();
+                message = heightmaps.recv() => match convert::observation_from_msg(message) {
+                    Ok(observation) => planner.on_heightmap(observation),
+                    Err(error) => {
+                        heightmaps.reject(error);
+                        None
                     }
-                    proposer.result(&result)
+                },
+                message = goals.recv() => match convert::goal_from_msg(message) {
+                    Ok(goal) => {
+                        // What was published before the goal is to be known before it: confirmations and results lead to goals.
+                        while let Some(message) = confirmations.try_recv() {
+                            confirm(&mut planner, &message);
+                        }
+                        let mut job = None;
+                        while let Some(message) = results.try_recv() {
+                            match convert::result_from_msg(&message) {
+                                Ok(result) => job = job.or(planner.on_result(&result)),
+                                Err(error) => results.reject(error),
+                            }
+                        }
+                        let next = planner.on_goal(goal);
+                        job.or(next)
+                    }
+                    Err(error) => {
+                        goals.reject(error);
+                        None
+                    }
+                },
+                message = confirmations.recv() => {
+                    confirm(&mut planner, &message);
+                    None
                 }
+                message = results.recv() => match convert::result_from_msg(&message) {
+                    Ok(result) => {
+                        if planner.needs_republish(&result) {
+                            self.outputs.republish();
+                        }
+                        planner.on_result(&result)
+                    }
+                    Err(error) => {
+                        results.reject(error);
+                        None
+                    }
+                },
                 answer = answers.recv() => {
                     let answer = answer.context("the network's thread has ended")?;
-                    let decision = answer.decision.as_ref().map_err(Clone::clone);
-                    let (proposal, job) = proposer.decided(decision);
+                    let prediction = answer.decision.as_ref().map(prediction);
+                    let prediction = prediction.as_ref().map_err(|reason| String::clone(reason));
+                    let (proposal, job) = planner.on_prediction(prediction);
                     if let Some(proposal) = proposal {
                         self.outputs.publish(proposal, &answer);
                     }
                     job
                 }
                 Ok(()) = changes.changed() => {
-                    proposer.set_change_rule(change_rule(&changes.borrow_and_update()));
+                    planner.set_rules(rules_of(&changes.borrow_and_update(), node));
                     None
                 }
             };
@@ -130,10 +162,42 @@ impl Active for PolicyNode {
     }
 }
 
-fn change_rule(parameters: &GctnPolicyParameters) -> ChangeRule {
-    ChangeRule {
-        tolerance_m: parameters.observation_tolerance_m as f32,
-        fraction: parameters.observation_changed_fraction,
+/// Decisions that are none concern the planner as little as those on a motion.
+fn confirm(planner: &mut ProposalPlanner, message: &StepConfirmation) {
+    if let Ok(confirmation) = convert::confirmation_from_msg(message) {
+        planner.on_confirmation(&confirmation);
+    }
+}
+
+fn rules_of(parameters: &GctnPolicyParameters, node: &Node) -> PlannerRules {
+    let checkpoint = parameters.checkpoint.file_stem().unwrap_or_default();
+    PlannerRules {
+        observation_tolerance_m: parameters.observation_tolerance_m as f32,
+        observation_changed_fraction: parameters.observation_changed_fraction,
+        rejected_radius_m: parameters.exclusion_radius_m,
+        checkpoint: checkpoint.to_string_lossy().into_owned(),
+        author: node.name().to_owned(),
+    }
+}
+
+fn prediction(decision: &Decision) -> Prediction {
+    Prediction {
+        pick: decision.pick,
+        place: decision.place,
+        pick_score: decision.pick_score as f32,
+        place_score: decision.place_score as f32,
+        success_probability: decision.success.map(|probability| probability as f32),
+    }
+}
+
+/// The images that the network is conditioned on.
+fn goal_for<'a>(policy: &Policy, job: &'a Job) -> Result<gctn::Goal<'a>, String> {
+    match (policy.config().conditioning, &job.previous) {
+        (GoalConditioning::Sequence, Some(previous)) => Ok(gctn::Goal::step(previous, &job.goal)),
+        (GoalConditioning::Sequence, None) => Err(
+            "the goal has no image before it, which the checkpoint is conditioned on: load a demonstration".to_owned(),
+        ),
+        _ => Ok((&*job.goal).into()),
     }
 }
 
@@ -149,9 +213,14 @@ fn start_network(
             // Held by the thread of an earlier activation until its last decision is made.
             let policy = policy.lock().unwrap_or_else(PoisonError::into_inner);
             let start = Instant::now();
-            let decision = policy
-                .decide(&job.observation, &*job.goal, &job.exclude)
-                .map_err(|error| error.to_string());
+            let exclude = job.exclude.iter();
+            let exclude: Vec<_> = exclude
+                .map(|disk| Isometry2::new(disk.center_m.coords, 0.0))
+                .collect();
+            let decision = goal_for(&policy, &job).and_then(|goal| {
+                let decision = policy.decide(&job.observation, goal, &exclude);
+                decision.map_err(|error| error.to_string())
+            });
             let took = start.elapsed();
             drop(policy);
             let answer = Answer {
@@ -170,31 +239,34 @@ fn start_network(
 struct Outputs {
     node: Node,
     /// The last proposal.
-    said: Option<PickPlace>,
+    last_proposal: Option<PickPlace>,
     proposals: Publisher<PickPlace>,
     markers: Publisher<MarkerArray>,
     scores: Publisher<Image>,
 }
 
 impl Outputs {
-    /// The same proposal once more; who knows it notices nothing.
-    fn say_again(&self) {
-        if let Some(proposal) = &self.said {
+    /// The same proposal once more: it changes nothing where it is known.
+    fn republish(&self) {
+        if let Some(proposal) = &self.last_proposal {
             info!("proposal {} still stands", proposal.id);
             self.proposals.publish(proposal.clone());
         }
     }
 
-    fn publish(&mut self, proposal: Result<PickPlace, String>, answer: &Answer) {
+    fn publish(&mut self, proposal: Result<Proposal, String>, answer: &Answer) {
         let took_s = ("network_s", format!("{:.3}", answer.took.as_secs_f64()));
-        let reason = match (proposal, &answer.decision) {
+        let message = proposal.and_then(|proposal| {
+            convert::proposal_to_msg(&proposal).map_err(|error| error.to_string())
+        });
+        let reason = match (message, &answer.decision) {
             (Ok(proposal), Ok(decision)) => {
                 let header = proposal.header.clone();
                 let message = format!(
                     "proposal {} for step {}, attempt {}",
                     proposal.id, proposal.step, proposal.attempt
                 );
-                self.said = Some(proposal.clone());
+                self.last_proposal = Some(proposal.clone());
                 self.proposals.publish(proposal);
                 info!("{message}");
                 self.node

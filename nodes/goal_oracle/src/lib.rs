@@ -1,70 +1,74 @@
-//! Node that holds the demonstration sequence and latches the next-step goal.
+//! Node that holds the demonstration sequence and publishes the next-step goal.
 //!
-//! Which goal is next is decided in [`Oracle`], which knows no ROS node.
+//! Which goal is next is decided in [`GoalTracker`], which knows no ROS node.
 
-mod oracle;
 mod parameters;
 
-use std::{path::Path, time::Duration};
+use std::{path::Path, sync::Arc, time::Duration};
 
 use anyhow::Context as _;
 use bags::Demonstration;
 use gctn::{Embedded, Embedding};
 use msgs::{
-    convert::{self, ConvertError},
+    convert,
     sctn_msgs::{
-        CaptureGoal, CaptureGoalRequest, CaptureGoalResponse, Goal, Heightmap, LoadDemonstration,
-        LoadDemonstrationRequest, LoadDemonstrationResponse, PickPlace, SetStep, SetStepRequest,
-        SetStepResponse, StepConfirmation, StepResult,
+        CaptureGoal, CaptureGoalRequest, CaptureGoalResponse, ConfirmationRefused, Goal, Heightmap,
+        LoadDemonstration, LoadDemonstrationRequest, LoadDemonstrationResponse, PickPlace,
+        PrimitiveSettings, SetStep, SetStepRequest, SetStepResponse, StepConfirmation, StepResult,
     },
-    std_msgs::Header,
 };
 use node_kit::{Active, Level, Node, Once, Publisher, Qos};
+use step_protocol::{
+    Capture, Change, ConfirmationRefusal, GoalSequence, GoalTracker, Observation, ProposalId,
+    StepJudge,
+};
 use tracing::{info, warn};
 
-pub use oracle::{
-    Capture, CaptureError, Change, Decider, NoSuchStep, Oracle, Refusal, SequenceError, sequence,
-};
 pub use parameters::{GoalModule, GoalOracleParameters};
 
 /// How long the first goal waits for policy and executor, so that none of their first words is lost.
 const PEERS: Duration = Duration::from_secs(5);
 
-/// Reads the demonstration; what it returns walks through its goals.
+/// Reads the demonstration; returns the node that walks through its goals.
 pub async fn configure(node: Node, parameters: GoalOracleParameters) -> anyhow::Result<OracleNode> {
-    let shown = match parameters.demonstration()? {
-        Some(path) => Some(Shown::read(path, &parameters.world_frame)?),
-        None => None,
+    let sequence = match parameters.demonstration()? {
+        Some(path) => read_goals(path)?,
+        None => GoalSequence::default(),
     };
-    let decider = match (parameters.goal_module, parameters.require_confirmation) {
-        (GoalModule::ImageDistance | GoalModule::Embedding, _) => Decider::Image,
-        (GoalModule::Oracle, true) => Decider::Operator,
-        (GoalModule::Oracle, false) => Decider::Outcome,
+    let judge = match (parameters.goal_module, parameters.require_confirmation) {
+        (GoalModule::ImageDistance | GoalModule::Embedding, _) => StepJudge::Image,
+        (GoalModule::Oracle, true) => StepJudge::Operator,
+        (GoalModule::Oracle, false) => StepJudge::Outcome,
     };
-    let (goals, start) = shown.map_or((Vec::new(), None), |shown| (shown.goals, Some(shown.start)));
-    let eye = match parameters.goal_module {
-        GoalModule::Oracle | GoalModule::ImageDistance => Eye::Images(Vec::new()),
+    let matcher = match parameters.goal_module {
+        GoalModule::Oracle | GoalModule::ImageDistance => ImageMatcher::Distance,
         GoalModule::Embedding => {
             let embedding = Embedding::load(&parameters.embedding);
-            Eye::Embedded(
-                Box::new(embedding.context("parameter embedding")?),
-                Vec::new(),
-            )
+            let embedding = embedding.context("parameter embedding")?;
+            ImageMatcher::Embedding(Box::new(embedding), Vec::new())
         }
     };
     Ok(OracleNode {
         goal: node.publisher::<Goal>("goal", Qos::Latched)?,
-        refusals: node.publisher::<StepResult>("step_result", Qos::Event)?,
-        oracle: Oracle::new(goals, decider),
-        start,
+        refusals: node.publisher::<ConfirmationRefused>("confirmation_refused", Qos::Event)?,
+        tracker: GoalTracker::new(sequence, judge),
         newest: None,
-        eye,
+        matcher,
         loads: Once::default(),
         captures: Once::default(),
         steps: Once::default(),
         node,
         parameters,
     })
+}
+
+/// The goals of a demonstration bag. Errors name the path.
+fn read_goals(path: &Path) -> anyhow::Result<GoalSequence> {
+    let shown = path.display();
+    let demonstration =
+        Demonstration::read(path).with_context(|| format!("demonstration {shown}"))?;
+    let goals = demonstration.into_goals();
+    goals.with_context(|| format!("demonstration {shown}"))
 }
 
 impl Active for OracleNode {
@@ -85,14 +89,23 @@ impl Active for OracleNode {
                 info!("nobody publishes {topic} yet; the first goal is latched all the same");
             }
         }
-        self.latch();
+        self.publish_goal();
         loop {
             let change = tokio::select! {
                 proposal = proposals.recv() => {
-                    self.oracle.proposed(&proposal);
+                    match convert::proposal_from_msg(&proposal) {
+                        Ok(proposal) => self.tracker.on_proposal(&proposal),
+                        Err(error) => proposals.reject(error),
+                    }
                     Change::None
                 }
-                result = results.recv() => self.oracle.result(&result),
+                result = results.recv() => match convert::result_from_msg(&result) {
+                    Ok(result) => self.tracker.on_result(&result),
+                    Err(error) => {
+                        results.reject(error);
+                        Change::None
+                    }
+                },
                 heightmap = heightmaps.recv() => {
                     if let Err(reason) = self.observed(heightmap) {
                         heightmaps.reject(reason);
@@ -100,10 +113,11 @@ impl Active for OracleNode {
                     Change::None
                 }
                 confirmation = confirmations.recv() => {
-                    self.oracle.confirmed(&confirmation).unwrap_or_else(|refusal| {
-                        warn!("confirmation refused: {refusal}");
+                    let read = convert::confirmation_from_msg(&confirmation);
+                    let change = read.and_then(|read| self.tracker.on_confirmation(&read));
+                    change.unwrap_or_else(|refusal| {
                         confirmations.reject(format_args!("refused: {refusal}"));
-                        self.refuse(&confirmation, &refusal);
+                        self.refuse(ProposalId(confirmation.proposal_id), &refusal);
                         Change::None
                     })
                 }
@@ -129,13 +143,16 @@ impl Active for OracleNode {
                     change
                 }
             };
+            for (id, refusal) in self.tracker.take_refused() {
+                self.refuse(id, &refusal);
+            }
             let change = match change {
                 Change::None => self.match_image(),
                 change => change,
             };
             match change {
                 Change::None => {}
-                Change::Goal(_) => self.latch(),
+                Change::Goal(_) => self.publish_goal(),
                 Change::Stopped => {
                     info!("stopped by the operator");
                     self.report();
@@ -145,73 +162,31 @@ impl Active for OracleNode {
     }
 }
 
-/// A demonstration as goals.
-struct Shown {
-    name: String,
-    goals: Vec<Goal>,
-    /// What was seen before the first step.
-    start: heightmap::Heightmap,
+/// How the goal modules that look at images compare them. What is embedded is kept until the goals change.
+enum ImageMatcher {
+    Distance,
+    Embedding(Box<Embedding>, Vec<Embedded>),
 }
 
-impl Shown {
-    /// Errors name the path.
-    fn read(path: &Path, world_frame: &str) -> anyhow::Result<Self> {
-        let shown = path.display();
-        let demonstration =
-            Demonstration::read(path).with_context(|| format!("demonstration {shown}"))?;
-        let goals = sequence(&demonstration, world_frame)
-            .with_context(|| format!("demonstration {shown}"))?;
-        Ok(Self {
-            name: goals
-                .first()
-                .map(|goal| goal.demonstration.clone())
-                .unwrap_or_default(),
-            start: demonstration.observation(0).clone(),
-            goals,
-        })
-    }
-}
-
-/// What is seen, and since when.
-struct Observation {
-    stamp: Duration,
-    heightmap: heightmap::Heightmap,
-    message: Heightmap,
-    /// It has said already which goal is next, or could not.
-    judged: bool,
-}
-
-/// How the goal modules that look at images compare them, and what they compare with: what was seen before
-/// the first step, then each goal. Empty until it is needed, and again when the goals change.
-enum Eye {
-    Images(Vec<heightmap::Heightmap>),
-    Embedded(Box<Embedding>, Vec<Embedded>),
-}
-
-impl Eye {
+impl ImageMatcher {
+    /// The goals have changed.
     fn forget(&mut self) {
-        match self {
-            Self::Images(images) => images.clear(),
-            Self::Embedded(_, images) => images.clear(),
+        if let Self::Embedding(_, known) = self {
+            known.clear();
         }
     }
 
-    /// How many goals are reached, as far as can be seen.
-    fn reached(
+    /// How many goals are reached: which of the known images, the first of them that of the start, is nearest.
+    fn reached<'a>(
         &mut self,
         seen: &heightmap::Heightmap,
-        images: impl Iterator<Item = heightmap::Heightmap>,
+        images: impl Iterator<Item = &'a heightmap::Heightmap>,
     ) -> Result<Option<usize>, gctn::Error> {
         match self {
-            Self::Images(known) => {
+            Self::Distance => Ok(seen.nearest(images)),
+            Self::Embedding(embedding, known) => {
                 if known.is_empty() {
-                    known.extend(images);
-                }
-                Ok(seen.nearest(&*known))
-            }
-            Self::Embedded(embedding, known) => {
-                if known.is_empty() {
-                    let embedded = images.map(|image| embedding.embed(&image));
+                    let embedded = images.map(|image| embedding.embed(image));
                     *known = embedded.collect::<Result<_, _>>()?;
                 }
                 Ok(Embedding::nearest(&embedding.embed(seen)?, known))
@@ -220,27 +195,34 @@ impl Eye {
     }
 }
 
+/// What is seen.
+struct Newest {
+    observation: Observation,
+    /// It has decided already which goal is next, or could not.
+    judged: bool,
+}
+
 /// The configured node. While it is inactive the run stays where it is.
 pub struct OracleNode {
     node: Node,
     parameters: GoalOracleParameters,
-    oracle: Oracle,
+    tracker: GoalTracker,
     goal: Publisher<Goal>,
-    refusals: Publisher<StepResult>,
-    /// What was seen before the first step of the demonstration.
-    start: Option<heightmap::Heightmap>,
-    newest: Option<Observation>,
-    eye: Eye,
+    refusals: Publisher<ConfirmationRefused>,
+    newest: Option<Newest>,
+    matcher: ImageMatcher,
     loads: Once<LoadDemonstrationResponse>,
     captures: Once<CaptureGoalResponse>,
     steps: Once<SetStepResponse>,
 }
 
 impl OracleNode {
-    fn latch(&self) {
-        match self.oracle.goal() {
-            Some(goal) => {
-                let (step, count, attempt) = self.oracle.progress();
+    fn publish_goal(&self) {
+        let world = &self.parameters.world_frame;
+        let goal = self.tracker.goal();
+        match goal.map(|goal| convert::goal_to_msg(&goal, world)) {
+            Some(Ok(goal)) => {
+                let (step, count, attempt) = self.tracker.progress();
                 if goal.complete {
                     info!("all {count} steps are done");
                 } else {
@@ -248,18 +230,19 @@ impl OracleNode {
                 }
                 self.goal.publish(goal);
             }
+            Some(Err(error)) => warn!("the goal cannot be published: {error}"),
             None => info!("no goals yet: call ~/load_demonstration or ~/capture_goal"),
         }
         self.report();
     }
 
     fn report(&self) {
-        let (step, count, attempt) = self.oracle.progress();
+        let (step, count, attempt) = self.tracker.progress();
         let message = if count == 0 {
             "no goals yet: call ~/load_demonstration or ~/capture_goal".to_owned()
-        } else if self.oracle.is_stopped() {
+        } else if self.tracker.is_stopped() {
             format!("stopped at step {step} of {count}")
-        } else if self.oracle.is_complete() {
+        } else if self.tracker.is_complete() {
             format!("all {count} steps are done")
         } else {
             format!("step {step} of {count}, attempt {attempt}")
@@ -275,45 +258,42 @@ impl OracleNode {
             let actual = &message.header.frame_id;
             return Err(format!("header.frame_id is {actual:?}, expected {world:?}"));
         }
-        let text = |error: ConvertError| error.to_string();
-        let stamp = convert::time_from_msg(&message.header.stamp).map_err(text)?;
-        let heightmap = convert::heightmap_from_msg(message.clone()).map_err(text)?;
-        // One of another table would be infinitely far from all images alike.
-        if let Some(start) = &self.start
-            && start.workspace != heightmap.workspace
+        let observation =
+            convert::observation_from_msg(message).map_err(|error| error.to_string())?;
+        // One of another workspace would be infinitely far from all images alike.
+        let workspace = observation.heightmap.workspace;
+        if let Some(start) = self.tracker.start()
+            && start.workspace != workspace
         {
             return Err(format!(
-                "workspace is {:?}, expected that of the demonstration, {:?}",
-                heightmap.workspace, start.workspace
+                "workspace is {workspace:?}, expected that of the demonstration, {:?}",
+                start.workspace
             ));
         }
-        self.newest = Some(Observation {
-            stamp,
-            heightmap,
-            message,
+        self.newest = Some(Newest {
+            observation,
             judged: false,
         });
         Ok(())
     }
 
-    /// The goal modules that look at images: decides by the newest heightmap, once, if it was seen after the
-    /// motion that waits for one.
+    /// The goal modules that look at images: decides by the newest heightmap, once, if it was seen after the motion that waits
+    /// for one.
     fn match_image(&mut self) -> Change {
-        let moved = self.oracle.waits_for_image();
-        let moved = moved.and_then(|stamp| convert::time_from_msg(&stamp).ok());
-        let (Some(moved), Some(seen), Some(start)) = (moved, &mut self.newest, &self.start) else {
+        let moved = self.tracker.waits_for_image();
+        let (Some(moved), Some(seen)) = (moved, &mut self.newest) else {
             return Change::None;
         };
-        if seen.stamp < moved || seen.judged {
+        let Some(images) = self.tracker.known_images() else {
+            return Change::None;
+        };
+        if seen.observation.stamp < moved || seen.judged {
             return Change::None;
         }
         seen.judged = true;
-        let goals = self.oracle.images().cloned();
-        // They were heightmaps before.
-        let goals = goals.filter_map(|image| convert::heightmap_from_msg(image).ok());
-        let images = std::iter::once(start.clone()).chain(goals);
-        match self.eye.reached(&seen.heightmap, images) {
-            Ok(Some(reached)) => self.oracle.matched(reached),
+        let heightmap = &seen.observation.heightmap;
+        match self.matcher.reached(heightmap, images) {
+            Ok(Some(reached)) => self.tracker.on_image_match(reached),
             Ok(None) => Change::None,
             Err(error) => {
                 warn!("what is seen cannot be compared: {error}");
@@ -322,18 +302,14 @@ impl OracleNode {
         }
     }
 
-    /// The operator's tools see a refusal where they see the executor's.
-    fn refuse(&self, confirmation: &StepConfirmation, refusal: &Refusal) {
-        self.refusals.publish(StepResult {
-            header: Header {
-                stamp: self.node.now(),
-                frame_id: self.parameters.world_frame.clone(),
-            },
-            proposal_id: confirmation.proposal_id,
-            outcome: StepResult::REFUSED,
-            reason: refusal.to_string(),
-            ..StepResult::default()
-        });
+    fn refuse(&self, id: ProposalId, refusal: &ConfirmationRefusal) {
+        warn!("confirmation refused: {refusal}");
+        let now = Duration::from_nanos(self.node.clock().now_ns().max(0) as u64);
+        let world = &self.parameters.world_frame;
+        match convert::confirmation_refused_to_msg(id, refusal, now, world) {
+            Ok(message) => self.refusals.publish(message),
+            Err(error) => warn!("the refusal cannot be published: {error}"),
+        }
     }
 
     async fn load(
@@ -352,23 +328,24 @@ impl OracleNode {
             Ok(Some(answer)) => return (answer, Change::None),
             Ok(None) => {}
         }
-        let world_frame = self.parameters.world_frame.clone();
         let reading = self
             .node
-            .spawn_blocking(move || Shown::read(Path::new(&request.path), &world_frame));
+            .spawn_blocking(move || read_goals(Path::new(&request.path)));
         let read = reading.await.context("reading panicked").flatten();
         let (answer, change) = match read {
-            Ok(shown) => {
+            Ok(sequence) => {
+                let goals = &sequence.goals;
+                let name = goals.first().map(|goal| goal.demonstration.clone());
+                let name = name.unwrap_or_default();
                 let answer = LoadDemonstrationResponse {
                     success: true,
-                    message: format!("{}, {} steps", shown.name, shown.goals.len()),
-                    demonstration: shown.name,
-                    step_count: shown.goals.len() as u32,
+                    message: format!("{name}, {} steps", goals.len()),
+                    demonstration: name,
+                    step_count: goals.len() as u32,
                 };
                 info!("loaded {}", answer.message);
-                self.start = Some(shown.start);
-                self.eye.forget();
-                (answer, self.oracle.load(shown.goals))
+                self.matcher.forget();
+                (answer, self.tracker.load(sequence))
             }
             Err(error) => (refusal(format!("{error:#}")), Change::None),
         };
@@ -377,7 +354,7 @@ impl OracleNode {
     }
 
     fn capture(&mut self, request: CaptureGoalRequest) -> (CaptureGoalResponse, Change) {
-        let (_, count, _) = self.oracle.progress();
+        let (_, count, _) = self.tracker.progress();
         let refusal = |message: String| {
             warn!("capture_goal: {message}");
             CaptureGoalResponse {
@@ -393,14 +370,14 @@ impl OracleNode {
         }
         let (answer, change) = match self.take_capture(&request) {
             Ok((stamp, step, change)) => {
-                let (_, step_count, _) = self.oracle.progress();
+                let (_, step_count, _) = self.tracker.progress();
                 let answer = CaptureGoalResponse {
                     success: true,
                     message: format!("the heightmap of {:.3} s", stamp.as_secs_f64()),
                     step,
                     step_count,
                 };
-                self.eye.forget();
+                self.matcher.forget();
                 info!("captured {} as step {step} of {step_count}", answer.message);
                 (answer, change)
             }
@@ -415,30 +392,39 @@ impl OracleNode {
         request: &CaptureGoalRequest,
     ) -> Result<(Duration, u32, Change), String> {
         let seen = self.newest.as_ref().ok_or("no heightmap has arrived")?;
-        let moved = convert::time_from_msg(&self.oracle.moved_until());
-        let moved = moved.map_err(|error| error.to_string())?;
-        if seen.stamp < moved {
+        let Observation {
+            stamp,
+            heightmap,
+            coverage,
+            ..
+        } = &seen.observation;
+        let (stamp, moved) = (*stamp, self.tracker.moved_until());
+        if stamp < moved {
             return Err(format!(
                 "the newest heightmap is of {:.3} s, before the last motion ended at {:.3} s",
-                seen.stamp.as_secs_f64(),
+                stamp.as_secs_f64(),
                 moved.as_secs_f64()
             ));
         }
-        if self.start.is_none() && self.parameters.goal_module != GoalModule::Oracle {
+        if self.tracker.start().is_none() && self.parameters.goal_module != GoalModule::Oracle {
             return Err(
                 "this goal_module needs the image before the first step: load a demonstration"
                     .into(),
             );
         }
+        let given = request.settings != PrimitiveSettings::default();
+        let settings = given.then(|| convert::settings_from_msg(&request.settings));
+        let settings = settings.transpose();
         let capture = Capture {
-            heightmap: seen.message.clone(),
+            image: Arc::clone(heightmap),
+            coverage: *coverage,
             append: request.append,
             module: request.module.clone(),
-            settings: request.settings,
+            settings: settings.map_err(|error| format!("settings.{error}"))?,
         };
-        let captured = self.oracle.capture(capture);
+        let captured = self.tracker.capture(capture);
         let (step, change) = captured.map_err(|error| error.to_string())?;
-        Ok((seen.stamp, step, change))
+        Ok((stamp, step, change))
     }
 
     fn set_step(&mut self, request: &SetStepRequest) -> (SetStepResponse, Change) {
@@ -449,12 +435,12 @@ impl OracleNode {
         let valid = known.is_ok();
         let change = match known {
             Ok(_) => self
-                .oracle
+                .tracker
                 .set_step(request.step)
                 .map_err(|none| none.to_string()),
             Err(invalid) => Err(invalid.to_string()),
         };
-        let (step, step_count, attempt) = self.oracle.progress();
+        let (step, step_count, attempt) = self.tracker.progress();
         let answer = |success, message| SetStepResponse {
             success,
             message,

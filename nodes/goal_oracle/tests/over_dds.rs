@@ -5,7 +5,8 @@ use std::time::Duration;
 use bags::{Demonstration, DemonstrationStep};
 use goal_oracle::GoalOracleParameters;
 use heightmap::{Heightmap, Workspace};
-use msgs::sctn_msgs::{Goal, PickPlace, StepConfirmation, StepResult};
+use msgs::convert;
+use msgs::sctn_msgs::{ConfirmationRefused, Goal, PickPlace, StepConfirmation, StepResult};
 use nalgebra::Isometry2;
 use node_kit::{Context, Network, NoParameters, ParameterSource, Qos, RosArguments, Subscription};
 use pick_place::{Outcome, PrimitiveSettings};
@@ -103,7 +104,7 @@ async fn results_and_confirmations_walk_through_a_demonstration() {
         .publisher::<StepConfirmation>("step_confirmation", Qos::Event)
         .unwrap();
     let mut answers = node
-        .subscription::<StepResult>("step_result", Qos::Event)
+        .subscription::<ConfirmationRefused>("confirmation_refused", Qos::Event)
         .unwrap();
     let mut goals = node.subscription::<Goal>("goal", Qos::Latched).unwrap();
     let arguments = RosArguments {
@@ -139,6 +140,7 @@ async fn results_and_confirmations_walk_through_a_demonstration() {
             problem: "placing".into(),
             step,
             attempt,
+            settings: convert::settings_to_msg(&PrimitiveSettings::RIGID),
             ..PickPlace::default()
         });
         pause().await;
@@ -156,21 +158,15 @@ async fn results_and_confirmations_walk_through_a_demonstration() {
 
     // The confirmation of before once more: refused, with the reason.
     confirmations.publish(says(StepConfirmation::ADVANCE, 12));
-    let refusal = timeout(LIMIT, async {
-        loop {
-            let answer = answers.recv().await;
-            if answer.outcome == StepResult::REFUSED {
-                return answer;
-            }
-        }
-    })
-    .await
-    .expect("a refusal");
-    assert_eq!(refusal.proposal_id, 12);
+    let refusal = timeout(LIMIT, answers.recv()).await.expect("a refusal");
+    assert_eq!(
+        (refusal.proposal_id, refusal.reason),
+        (12, ConfirmationRefused::STALE)
+    );
     assert!(
-        refusal.reason.contains("earlier goal"),
+        refusal.message.contains("earlier goal"),
         "{}",
-        refusal.reason
+        refusal.message
     );
 
     propose(13, 1, 2).await;

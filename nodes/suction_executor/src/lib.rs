@@ -1,10 +1,9 @@
 //! Node that executes approved proposals through the UR driver interface.
 //!
-//! [`gate`] decides what may move, without middleware; the rest moves it through the driver's own
+//! [`step_protocol::ApprovalGate`] decides what may move, without middleware; the rest moves it through the driver's own
 //! topics, service and actions, and reports.
 
 mod driver;
-pub mod gate;
 mod home;
 mod node;
 mod parameters;

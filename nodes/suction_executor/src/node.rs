@@ -1,13 +1,11 @@
 //! Topics in, motion and results out.
 
-use std::collections::VecDeque;
 use std::path::Path;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use anyhow::Context as _;
-use heightmap::Workspace;
-use msgs::convert::{self, ConvertError};
+use msgs::convert;
 use msgs::sctn_msgs::{self, ExecutePickPlace, ExecutePickPlaceFeedback, ExecutePickPlaceResult};
 use msgs::sensor_msgs::JointState;
 use msgs::std_msgs::Bool;
@@ -18,7 +16,11 @@ use node_kit::{
     ActionServer, Active, Level, NewGoal, Node, Publisher, Qos, RequestId, RunningGoal,
     ServiceServer, Subscription,
 };
-use pick_place::{ExecuteError, Outcome, Phase, PickPlace};
+use pick_place::{ExecuteError, Outcome, Phase};
+use step_protocol::{
+    ApprovalGate, GateAction, GateRules, OperatorDecision, Proposal, ProposalId, Proposed, Report,
+    StepOutcome, StepResult,
+};
 use tokio::runtime::Handle;
 use tokio::sync::{mpsc, watch};
 use tokio::task::JoinHandle;
@@ -27,15 +29,12 @@ use tracing::{error, info, warn};
 use ur5::WorkCell;
 
 use crate::driver::{DriverError, DriverRobot, Link};
-use crate::gate::{Answer, Decision, Gate, Proposal, Proposed, Rules, Verdict};
 use crate::home::go_home;
 use crate::parameters::{Driver, SuctionExecutorParameters};
 use crate::presence::Presence;
-use crate::rehearsal::rehearse;
+use crate::rehearsal::RobotNow;
 use crate::status::{DriverStatus, JointReading, Pins, StillRule};
 
-/// Confirmations that wait for their proposal; more are refused at once.
-const WAITING_CONFIRMATIONS: usize = 16;
 /// Calls of `home` that are answered when the arm is there; more fail at once.
 const WAITING_CALLS: usize = 16;
 /// Joints move less than this from one reading to the next while they stand still: the noise of
@@ -45,7 +44,7 @@ const STILL_STEP_RAD: f64 = 1e-4;
 const STOP_GRACE: Duration = Duration::from_millis(1500);
 const DIAGNOSTICS_PERIOD: Duration = Duration::from_millis(500);
 
-/// Loads the work cell and listens to the driver; what it returns moves.
+/// Loads the work cell and listens to the driver; returns the node that executes proposals.
 pub async fn configure(
     node: Node,
     parameters: SuctionExecutorParameters,
@@ -69,8 +68,7 @@ pub async fn configure(
     )?;
     Ok(ExecutorNode {
         results: node.publisher("step_result", Qos::Event)?,
-        gate: Gate::new(rules(&parameters)),
-        automatic: !parameters.require_approval,
+        gate: ApprovalGate::new(rules(&parameters)),
         link: Arc::new(link),
         work_cell,
         status,
@@ -78,23 +76,21 @@ pub async fn configure(
     })
 }
 
-fn rules(parameters: &SuctionExecutorParameters) -> Rules {
-    Rules {
+fn rules(parameters: &SuctionExecutorParameters) -> GateRules {
+    GateRules {
         frame: parameters.world_frame.clone(),
-        workspace: Workspace::RAVENS,
-        most: parameters.limits.settings(),
+        limits: parameters.limits.settings(),
         observation_tolerance_m: parameters.observation_tolerance_m as f32,
         observation_changed_fraction: parameters.observation_changed_fraction,
-        status_max_age: Duration::from_secs_f64(parameters.driver.status_max_age_s),
+        confirmation_grace: Duration::from_secs_f64(parameters.confirmation_grace_s),
+        require_approval: parameters.require_approval,
     }
 }
 
 /// The configured node. What was used or stopped stays so while it is inactive.
 pub struct ExecutorNode {
     results: Publisher<sctn_msgs::StepResult>,
-    gate: Gate,
-    /// Whether new proposals move by themselves.
-    automatic: bool,
+    gate: ApprovalGate,
     link: Arc<Link>,
     work_cell: WorkCell,
     status: watch::Receiver<DriverStatus>,
@@ -121,8 +117,6 @@ impl Active for ExecutorNode {
             phase_sender,
             phases,
             gate: &mut self.gate,
-            automatic: &mut self.automatic,
-            waiting: VecDeque::new(),
             motion: None,
             link: Arc::clone(&self.link),
             node: node.clone(),
@@ -198,18 +192,11 @@ fn level(states: &[Digital], pin: u8) -> Option<bool> {
         .map(|state| state.state)
 }
 
-/// A confirmation that may be ahead of what it speaks of.
-struct Waiting {
-    id: u64,
-    decision: Decision,
-    until: Instant,
-}
-
 /// What moves the arm.
 #[derive(Clone, Copy, PartialEq, Eq)]
 enum Cause {
     /// An approved proposal.
-    Proposal(u64),
+    Proposal(ProposalId),
     /// A call of the service `home`.
     Home,
 }
@@ -224,7 +211,7 @@ struct Motion {
 /// A goal of the action, from its acceptance to its end.
 struct Goal {
     /// Its proposal.
-    id: u64,
+    id: ProposalId,
     running: RunningGoal<ExecutePickPlace>,
     moving: bool,
     cancelling: bool,
@@ -256,10 +243,7 @@ struct Executor<'a> {
     phase_sender: mpsc::UnboundedSender<Phase>,
     /// Phases of the motion under way.
     phases: mpsc::UnboundedReceiver<Phase>,
-    gate: &'a mut Gate,
-    /// Whether new proposals move by themselves.
-    automatic: &'a mut bool,
-    waiting: VecDeque<Waiting>,
+    gate: &'a mut ApprovalGate,
     motion: Option<Motion>,
     link: Arc<Link>,
     status: watch::Receiver<DriverStatus>,
@@ -274,7 +258,7 @@ impl Executor<'_> {
         let node = self.node.clone();
         let mut diagnostics = tokio::time::interval(DIAGNOSTICS_PERIOD);
         loop {
-            let deadline = self.waiting.front().map(|waiting| waiting.until);
+            let deadline = self.gate.deadline().map(|deadline| self.origin + deadline);
             let absence = self.absence();
             tokio::select! {
                 message = self.heightmaps.recv() => self.on_heightmap(message),
@@ -296,6 +280,7 @@ impl Executor<'_> {
                 () = node.deactivated() => break,
             }
         }
+        self.gate.deactivate();
         for call in std::mem::take(&mut self.home_calls) {
             let response = TriggerResponse {
                 success: false,
@@ -346,7 +331,6 @@ impl Executor<'_> {
     }
 
     fn on_heightmap(&mut self, message: sctn_msgs::Heightmap) {
-        let stamp = convert::time_from_msg(&message.header.stamp);
         let frame_id = message.header.frame_id.clone();
         if frame_id != self.parameters.world_frame {
             let expected = &self.parameters.world_frame;
@@ -355,9 +339,9 @@ impl Executor<'_> {
             ));
             return;
         }
-        match stamp.and_then(|stamp| Ok((stamp, convert::heightmap_from_msg(message)?))) {
-            Ok((stamp, heightmap)) => {
-                self.gate.observe(stamp, heightmap);
+        match convert::observation_from_msg(message) {
+            Ok(seen) => {
+                self.gate.on_heightmap(seen.stamp, seen.heightmap);
                 self.ask_again();
             }
             Err(error) => self.heightmaps.reject(error),
@@ -365,19 +349,19 @@ impl Executor<'_> {
     }
 
     fn on_proposal(&mut self, message: sctn_msgs::PickPlace) {
-        let id = message.id;
-        match self.gate.propose(id, read_proposal(&message)) {
-            Proposed::Open => {
+        let id = ProposalId(message.id);
+        match self.gate.on_proposal(id, read_proposal(&message)) {
+            Proposed::Pending => {
                 info!("proposal {id}");
-                if *self.automatic {
-                    self.confirm(id, Decision::Approve, None);
+                if self.gate.is_automatic() {
+                    self.confirm(id, OperatorDecision::Approve);
                 }
             }
             Proposed::Repeated => {}
             Proposed::Invalid(reason) => {
                 self.proposals.reject(&reason);
-                if *self.automatic {
-                    self.report(id, sctn_msgs::StepResult::REFUSED, reason, None);
+                if self.gate.is_automatic() {
+                    self.report(self.refusal(id, reason.to_string()), None);
                 }
             }
         }
@@ -387,7 +371,7 @@ impl Executor<'_> {
 
     /// A goal of the action is a proposal whose way its client follows; it goes through the same gate.
     fn on_goal(&mut self, new: NewGoal<ExecutePickPlace>) {
-        let id = new.goal.proposal.id;
+        let id = ProposalId(new.goal.proposal.id);
         let busy = match (&self.goal, &self.motion) {
             (Some(goal), _) => Some(format!("a goal for proposal {} is active", goal.id)),
             (None, Some(motion)) => Some(match motion.cause {
@@ -396,17 +380,23 @@ impl Executor<'_> {
             }),
             (None, None) => None,
         };
-        let open = match busy {
+        let pending = match busy {
             Some(busy) => Err(busy),
-            None => match self.gate.propose(id, read_proposal(&new.goal.proposal)) {
-                Proposed::Invalid(reason) => Err(reason),
-                Proposed::Open | Proposed::Repeated => self.gate.open(id),
-            },
+            None => {
+                let proposed = self.gate.on_proposal(id, read_proposal(&new.goal.proposal));
+                match proposed {
+                    Proposed::Invalid(reason) => Err(reason.to_string()),
+                    Proposed::Pending | Proposed::Repeated => self
+                        .gate
+                        .check_pending(id)
+                        .map_err(|refusal| refusal.to_string()),
+                }
+            }
         };
-        if let Err(reason) = open {
+        if let Err(reason) = pending {
             let reason = format!("goal for proposal {id} rejected: {reason}");
             new.reject(&reason);
-            let refusal = self.result(id, sctn_msgs::StepResult::REFUSED, reason, None);
+            let refusal = self.result(self.refusal(id, reason), None);
             self.results.publish(refusal);
             return;
         }
@@ -417,8 +407,8 @@ impl Executor<'_> {
             moving: false,
             cancelling: false,
         });
-        if *self.automatic {
-            self.confirm(id, Decision::Approve, None);
+        if self.gate.is_automatic() {
+            self.confirm(id, OperatorDecision::Approve);
         } else {
             self.feedback(ExecutePickPlaceFeedback::AWAITING_APPROVAL);
         }
@@ -437,7 +427,11 @@ impl Executor<'_> {
             _ => {
                 self.gate.withdraw(id);
                 let reason = "the goal was cancelled; nothing was moving".to_owned();
-                self.report(id, sctn_msgs::StepResult::STOPPED, reason, None);
+                let stopped = Report {
+                    outcome: StepOutcome::Stopped,
+                    ..self.refusal(id, reason)
+                };
+                self.report(stopped, None);
             }
         }
     }
@@ -446,27 +440,26 @@ impl Executor<'_> {
     fn look_after_goal(&mut self) {
         if let Some(goal) = &self.goal
             && !goal.moving
-            && let Err(reason) = self.gate.open(goal.id)
+            && let Err(refusal) = self.gate.check_pending(goal.id)
         {
-            self.report(goal.id, sctn_msgs::StepResult::REFUSED, reason, None);
+            self.report(self.refusal(goal.id, refusal.to_string()), None);
         }
     }
 
     /// Ends the goal of a proposal with its result, if it has one and this is its end.
-    fn finish_goal(&mut self, result: sctn_msgs::StepResult, motion_ended: bool) {
-        use sctn_msgs::StepResult;
-        let is_end =
-            |goal: &mut Goal| goal.id == result.proposal_id && (motion_ended || !goal.moving);
+    fn finish_goal(&mut self, outcome: StepOutcome, result: sctn_msgs::StepResult, moved: bool) {
+        let id = ProposalId(result.proposal_id);
+        let is_end = |goal: &mut Goal| goal.id == id && (moved || !goal.moving);
         let Some(goal) = self.goal.take_if(is_end) else {
             return;
         };
         // Nothing moves for a goal that has ended.
         self.gate.withdraw(goal.id);
-        let (outcome, cancelled) = (result.outcome, goal.running.is_cancel_requested());
+        let cancelled = goal.running.is_cancel_requested();
         let result = ExecutePickPlaceResult { result };
         match outcome {
-            StepResult::PLACED => goal.running.succeed(result),
-            StepResult::STOPPED if cancelled => goal.running.cancelled(result),
+            StepOutcome::Placed => goal.running.succeed(result),
+            StepOutcome::Stopped if cancelled => goal.running.cancelled(result),
             _ => goal.running.abort(result),
         }
     }
@@ -484,14 +477,13 @@ impl Executor<'_> {
                     stamp: self.node.now(),
                     frame_id: self.parameters.world_frame.clone(),
                 },
-                proposal_id: goal.id,
+                proposal_id: goal.id.0,
                 phase,
             });
         }
     }
 
     fn on_confirmation(&mut self, message: sctn_msgs::StepConfirmation) {
-        use sctn_msgs::StepConfirmation;
         // What was sent before it is to be known before it.
         while let Some(heightmap) = self.heightmaps.try_recv() {
             self.on_heightmap(heightmap);
@@ -499,101 +491,73 @@ impl Executor<'_> {
         while let Some(proposal) = self.proposals.try_recv() {
             self.on_proposal(proposal);
         }
-        let id = message.proposal_id;
-        let decision = match message.decision {
-            StepConfirmation::APPROVE => Decision::Approve,
-            StepConfirmation::REJECT => Decision::Reject,
-            StepConfirmation::STOP => Decision::Stop,
-            // For the goal oracle.
-            StepConfirmation::ADVANCE | StepConfirmation::RETRY => return,
-            other => {
-                let reason = format!(
-                    "decision is {other}, expected APPROVE (1), REJECT (2), ADVANCE (3), RETRY (4) or STOP (5)"
-                );
-                self.confirmations.reject(&reason);
-                self.report(id, sctn_msgs::StepResult::REFUSED, reason, None);
+        let id = ProposalId(message.proposal_id);
+        let decision = match convert::confirmation_from_msg(&message) {
+            Ok(confirmation) => confirmation.decision,
+            Err(refusal) => {
+                self.confirmations.reject(&refusal);
+                self.report(self.refusal(id, refusal.to_string()), None);
                 return;
             }
         };
+        if step_protocol::Judgement::from_decision(decision).is_some() {
+            // For the goal oracle.
+            return;
+        }
         info!(
-            "{decision:?} of proposal {id} by `{}`",
+            "{} of proposal {id} by `{}`",
+            decision.name(),
             message.operator_name
         );
-        self.confirm(id, decision, None);
+        self.confirm(id, decision);
+    }
+
+    fn confirm(&mut self, id: ProposalId, decision: OperatorDecision) {
+        let (robot, now) = (self.robot(), self.origin.elapsed());
+        let actions = self.gate.on_confirmation(id, decision, &robot, now);
+        self.act(actions);
     }
 
     /// Confirmations whose proposal or heightmap was still on its way.
     fn ask_again(&mut self) {
-        for waiting in std::mem::take(&mut self.waiting) {
-            self.confirm(waiting.id, waiting.decision, Some(waiting.until));
+        let (robot, now) = (self.robot(), self.origin.elapsed());
+        let actions = self.gate.on_news(&robot, now);
+        self.act(actions);
+    }
+
+    fn robot(&self) -> RobotNow {
+        RobotNow {
+            arm: self.work_cell.arm.clone(),
+            status: self.status.borrow().clone(),
+            now: self.origin.elapsed(),
+            max_age: Duration::from_secs_f64(self.parameters.driver.status_max_age_s),
+            unattended: self.unattended(),
         }
     }
 
-    /// `until`: how long it may wait, where it has waited already.
-    fn confirm(&mut self, id: u64, decision: Decision, until: Option<Instant>) {
-        use sctn_msgs::StepResult;
-        if decision == Decision::Stop {
-            // Nothing goes on by itself after a stop.
-            *self.automatic = false;
-            for waiting in std::mem::take(&mut self.waiting) {
-                let reason = format!("proposal {}: a stop came before it", waiting.id);
-                self.report(waiting.id, StepResult::REFUSED, reason, None);
-            }
-        }
-        if decision == Decision::Approve
-            && let Some(reason) = self.unattended()
-        {
-            self.report(
-                id,
-                StepResult::REFUSED,
-                format!("proposal {id}: {reason}"),
-                None,
-            );
-            return;
-        }
-        let arm = &self.work_cell.arm;
-        let verdict = self.gate.confirm(
-            id,
-            decision,
-            &self.status.borrow(),
-            self.origin.elapsed(),
-            |status, proposal| rehearse(arm, status, proposal),
-        );
-        match verdict {
-            Verdict::Move(proposal) => {
-                // After a stop or a fault an approval lets things go on.
-                *self.automatic = !self.parameters.require_approval;
-                self.begin(*proposal);
-            }
-            Verdict::Cancel => {
-                if let Some(motion) = &self.motion {
-                    motion.stop.cancel();
+    fn act(&mut self, actions: Vec<GateAction>) {
+        for action in actions {
+            match action {
+                GateAction::Move(proposal) => self.begin(*proposal),
+                GateAction::Cancel => {
+                    if let Some(motion) = &self.motion {
+                        motion.stop.cancel();
+                    }
                 }
+                GateAction::Report(report) => self.report(report, None),
             }
-            Verdict::Answer(answer, reason) => {
-                let outcome = match answer {
-                    Answer::Refused => StepResult::REFUSED,
-                    Answer::Rejected => StepResult::REJECTED,
-                    Answer::Stopped => StepResult::STOPPED,
-                };
-                self.report(id, outcome, reason, None);
-            }
-            Verdict::Wait(reason) => {
-                let grace = Duration::from_secs_f64(self.parameters.confirmation_grace_s);
-                let until = until.unwrap_or_else(|| Instant::now() + grace);
-                if Instant::now() >= until || self.waiting.len() >= WAITING_CONFIRMATIONS {
-                    self.report(id, StepResult::REFUSED, reason, None);
-                } else {
-                    self.waiting.push_back(Waiting {
-                        id,
-                        decision,
-                        until,
-                    });
-                }
-            }
-            Verdict::Nothing => {}
         }
         self.look_after_goal();
+    }
+
+    /// A refusal with where the proposal stands.
+    fn refusal(&self, id: ProposalId, reason: String) -> Report {
+        Report {
+            id,
+            outcome: StepOutcome::Refused,
+            reason,
+            status: self.gate.status(id),
+        }
     }
 
     fn begin(&mut self, proposal: Proposal) {
@@ -627,13 +591,7 @@ impl Executor<'_> {
             .as_ref()
             .is_some_and(|motion| motion.cause == Cause::Home);
         if !at_work {
-            let allowed = match self.unattended() {
-                Some(reason) => Err(reason),
-                None => self
-                    .gate
-                    .go_home(&self.status.borrow(), self.origin.elapsed()),
-            };
-            if let Err(reason) = allowed {
+            if let Err(reason) = self.gate.go_home(&self.robot()) {
                 warn!("home: {reason}");
                 self.home.respond(
                     call,
@@ -682,7 +640,6 @@ impl Executor<'_> {
     }
 
     fn on_end(&mut self, cause: Cause, stopped: bool, ended: anyhow::Result<Ended>) {
-        use sctn_msgs::StepResult;
         while let Ok(phase) = self.phases.try_recv() {
             self.say_phase(phase);
         }
@@ -691,29 +648,27 @@ impl Executor<'_> {
             Err(error) => (Err(error), None),
         };
         let (outcome, mut reason) = match result {
-            Ok(Ok(Some(outcome))) => (convert::outcome_to_msg(outcome), why(outcome).to_owned()),
-            Ok(Ok(None)) => (StepResult::PLACED, "at home".to_owned()),
+            Ok(Ok(Some(outcome))) => (StepOutcome::from(outcome), why(outcome).to_owned()),
+            Ok(Ok(None)) => (StepOutcome::Placed, "at home".to_owned()),
             Ok(Err(ExecuteError::Robot {
                 phase,
                 error: DriverError::Stopped,
             })) => (
-                StepResult::STOPPED,
+                StepOutcome::Stopped,
                 format!("{phase:?}: {}", DriverError::Stopped),
             ),
-            Ok(Err(error)) => (StepResult::FAULT, one_line(&error.to_string())),
-            Err(error) => (StepResult::FAULT, format!("{error:#}")),
+            Ok(Err(error)) => (StepOutcome::Fault, one_line(&error.to_string())),
+            Err(error) => (StepOutcome::Fault, format!("{error:#}")),
         };
-        let broken_off = matches!(outcome, StepResult::STOPPED | StepResult::FAULT);
+        let broken_off = matches!(outcome, StepOutcome::Stopped | StepOutcome::Fault);
         if broken_off {
-            // Nothing goes on by itself.
-            *self.automatic = false;
             reason += "; the arm stands where it is, suction is as it was; a new observation and approval are needed";
         } else if stopped {
             reason = format!("the stop came after the end. {reason}")
                 .trim()
                 .to_owned();
         }
-        let level = if outcome == StepResult::FAULT {
+        let level = if outcome == StepOutcome::Fault {
             Level::Error
         } else {
             Level::Ok
@@ -723,9 +678,17 @@ impl Executor<'_> {
         let now = Duration::from_nanos(self.node.clock().now_ns().max(0) as u64);
         let end = stamps.map_or(now, |(_, last)| last.max(now));
         let duration = stamps.map_or(Duration::ZERO, |(first, last)| last - first.min(last));
-        self.gate.finish(end);
+        let actions = self.gate.finish(end, broken_off);
         match cause {
-            Cause::Proposal(id) => self.report(id, outcome, reason, Some((end, duration))),
+            Cause::Proposal(id) => {
+                let report = Report {
+                    id,
+                    outcome,
+                    reason,
+                    status: self.gate.status(id),
+                };
+                self.report(report, Some((end, duration)));
+            }
             Cause::Home => {
                 info!("home: {reason}");
                 for call in std::mem::take(&mut self.home_calls) {
@@ -737,51 +700,56 @@ impl Executor<'_> {
                 }
             }
         }
+        self.act(actions);
         self.ask_again();
     }
 
     /// `motion`: when it ended and how long it took.
-    fn report(
-        &mut self,
-        id: u64,
-        outcome: u8,
-        reason: String,
-        motion: Option<(Duration, Duration)>,
-    ) {
-        use sctn_msgs::StepResult;
+    fn report(&mut self, report: Report, motion: Option<(Duration, Duration)>) {
+        let Report {
+            id,
+            outcome,
+            reason,
+            ..
+        } = &report;
+        let (outcome, name) = (*outcome, outcome.name());
         match outcome {
-            StepResult::PLACED | StepResult::REJECTED => {
-                info!("proposal {id}: {}. {reason}", name(outcome))
+            StepOutcome::Placed | StepOutcome::Rejected => {
+                info!("proposal {id}: {name}. {reason}")
             }
-            StepResult::FAULT => error!("proposal {id}: {}: {reason}", name(outcome)),
-            _ => warn!("proposal {id}: {}: {reason}", name(outcome)),
+            StepOutcome::Fault => error!("proposal {id}: {name}: {reason}"),
+            _ => warn!("proposal {id}: {name}: {reason}"),
         }
-        let result = self.result(id, outcome, reason, motion);
+        let result = self.result(report, motion);
         self.results.publish(result.clone());
-        self.finish_goal(result, motion.is_some());
+        self.finish_goal(outcome, result, motion.is_some());
     }
 
     fn result(
         &self,
-        id: u64,
-        outcome: u8,
-        reason: String,
+        report: Report,
         motion: Option<(Duration, Duration)>,
     ) -> sctn_msgs::StepResult {
-        let (end, duration) = match motion {
-            Some((end, duration)) => (convert::time_to_msg(end).ok(), duration),
-            None => (None, Duration::ZERO),
+        let now = Duration::from_nanos(self.node.clock().now_ns().max(0) as u64);
+        let (stamp, duration) = motion.unwrap_or((now, Duration::ZERO));
+        let result = StepResult {
+            stamp,
+            proposal_id: report.id,
+            outcome: report.outcome,
+            reason: report.reason,
+            duration,
+            status: report.status,
         };
-        sctn_msgs::StepResult {
-            header: msgs::std_msgs::Header {
-                stamp: end.unwrap_or_else(|| self.node.now()),
-                frame_id: self.parameters.world_frame.clone(),
-            },
-            proposal_id: id,
-            outcome,
-            reason,
-            duration: convert::duration_to_msg(duration).unwrap_or_default(),
-        }
+        convert::result_to_msg(&result, &self.parameters.world_frame).unwrap_or_else(|error| {
+            // A clock beyond what a stamp can hold.
+            error!("the result of proposal {}: {error}", result.proposal_id);
+            sctn_msgs::StepResult {
+                proposal_id: result.proposal_id.0,
+                outcome: result.outcome.code(),
+                reason: result.reason.clone(),
+                ..Default::default()
+            }
+        })
     }
 
     fn diagnose(&self) {
@@ -830,18 +798,7 @@ async fn sleep_until(deadline: Option<Instant>) {
 /// Says what is wrong with a message and in which field.
 fn read_proposal(message: &sctn_msgs::PickPlace) -> Result<Proposal, String> {
     let id = message.id;
-    let of =
-        |field: &'static str| move |error: ConvertError| format!("proposal {id}: {field}.{error}");
-    Ok(Proposal {
-        id,
-        frame: message.header.frame_id.clone(),
-        stamp: convert::time_from_msg(&message.header.stamp).map_err(of("header"))?,
-        action: PickPlace {
-            pick: convert::pose2d_from_msg(&message.pick).map_err(of("pick"))?,
-            place: convert::pose2d_from_msg(&message.place).map_err(of("place"))?,
-        },
-        settings: convert::settings_from_msg(&message.settings).map_err(of("settings"))?,
-    })
+    convert::proposal_from_msg(message).map_err(|error| format!("proposal {id}: {error}"))
 }
 
 fn why(outcome: Outcome) -> &'static str {
@@ -851,22 +808,6 @@ fn why(outcome: Outcome) -> &'static str {
         Outcome::GraspFailed => "suction held nothing",
         Outcome::Dropped => "the object was lost on the way",
         Outcome::LagAborted => "the tip lagged too far behind; the object was released",
-    }
-}
-
-fn name(outcome: u8) -> &'static str {
-    use sctn_msgs::StepResult;
-    match outcome {
-        StepResult::PLACED => "PLACED",
-        StepResult::NO_CONTACT => "NO_CONTACT",
-        StepResult::GRASP_FAILED => "GRASP_FAILED",
-        StepResult::DROPPED => "DROPPED",
-        StepResult::LAG_ABORTED => "LAG_ABORTED",
-        StepResult::REFUSED => "REFUSED",
-        StepResult::REJECTED => "REJECTED",
-        StepResult::FAULT => "FAULT",
-        StepResult::STOPPED => "STOPPED",
-        _ => "unknown outcome",
     }
 }
 

@@ -1,11 +1,12 @@
 //! A primitive carried out in thought, to know beforehand whether all of it can be planned.
 
 use std::convert::Infallible;
+use std::time::Duration;
 
 use pick_place::Robot;
+use step_protocol::{Proposal, RobotState};
 use ur5::{Arm, JointTrajectory, Joints};
 
-use crate::gate::Proposal;
 use crate::status::DriverStatus;
 
 /// A robot that is always where it was sent, and whose tool finds the table.
@@ -40,28 +41,40 @@ impl Robot for Rehearsal {
     }
 }
 
-/// Plans every motion of a proposal from where the robot is; says why one cannot be planned.
-pub(crate) fn rehearse(
-    arm: &Arm,
-    status: &DriverStatus,
-    proposal: &Proposal,
-) -> Result<(), String> {
-    let (Some(joints), Some(pins)) = (&status.joints, &status.pins) else {
-        return Err("the robot's state is not known".into());
-    };
-    let mut robot = Rehearsal {
-        joints: joints.value.positions_rad,
-        holds: pins.value.vacuum,
-    };
-    pick_place::execute(
-        &mut robot,
-        arm,
-        &proposal.action,
-        &proposal.settings,
-        |_| (),
-    )
-    .map(|_| ())
-    .map_err(|error| one_line(&error.to_string()))
+/// What the gate asks about: the robot as its driver last said it was.
+pub(crate) struct RobotNow {
+    pub arm: Arm,
+    pub status: DriverStatus,
+    /// Monotonic, as the arrivals in `status`.
+    pub now: Duration,
+    /// The driver's streams may not be older.
+    pub max_age: Duration,
+    /// Why nothing may begin to move, where an operator has to be present and none is.
+    pub unattended: Option<String>,
+}
+
+impl RobotState for RobotNow {
+    fn obstacle(&self) -> Option<String> {
+        let unattended = self.unattended.clone();
+        unattended.or_else(|| self.status.obstacle(self.now, self.max_age))
+    }
+
+    /// Plans every motion of a proposal from where the robot is.
+    fn plan(&self, proposal: &Proposal) -> Result<(), String> {
+        let (Some(joints), Some(pins)) = (&self.status.joints, &self.status.pins) else {
+            return Err("the robot's state is not known".into());
+        };
+        let mut robot = Rehearsal {
+            joints: joints.value.positions_rad,
+            holds: pins.value.vacuum,
+        };
+        let Proposal {
+            action, settings, ..
+        } = proposal;
+        pick_place::execute(&mut robot, &self.arm, action, settings, |_| ())
+            .map(|_| ())
+            .map_err(|error| one_line(&error.to_string()))
+    }
 }
 
 /// Poses print themselves over several lines.
@@ -76,20 +89,29 @@ mod tests {
     use crate::status::{Newest, Pins};
     use nalgebra::{Isometry2, Vector2};
     use pick_place::{PickPlace, PrimitiveSettings};
-    use std::time::Duration;
+    use step_protocol::ProposalId;
     use ur5::WorkCell;
 
     fn proposal(x_m: f64) -> Proposal {
         let pose = |y_m| Isometry2::new(Vector2::new(x_m, y_m), 0.0);
         Proposal {
-            id: 1,
+            id: ProposalId(1),
             frame: "world".into(),
             stamp: Duration::ZERO,
+            problem: "placing".into(),
+            step: 1,
+            attempt: 0,
+            module: "placing".into(),
             action: PickPlace {
                 pick: pose(0.1),
                 place: pose(-0.1),
             },
             settings: PrimitiveSettings::RIGID,
+            pick_score: 1.0,
+            place_score: 1.0,
+            success_probability: None,
+            checkpoint: String::new(),
+            author: "test".into(),
         }
     }
 
@@ -98,8 +120,16 @@ mod tests {
         let arm = WorkCell::builtin().unwrap().arm;
         let mut status = ready(Duration::ZERO);
         status.joints.as_mut().unwrap().value.positions_rad = arm.home;
-        rehearse(&arm, &status, &proposal(0.5)).unwrap();
-        let reason = rehearse(&arm, &status, &proposal(2.0)).unwrap_err();
+        let mut robot = RobotNow {
+            arm,
+            status,
+            now: Duration::ZERO,
+            max_age: Duration::from_secs(1),
+            unattended: None,
+        };
+        assert_eq!(robot.obstacle(), None);
+        robot.plan(&proposal(0.5)).unwrap();
+        let reason = robot.plan(&proposal(2.0)).unwrap_err();
         assert!(
             reason.contains("pick") && !reason.contains('\n'),
             "{reason}"
@@ -108,12 +138,14 @@ mod tests {
             suction: true,
             vacuum: true,
         };
-        status.pins = Some(Newest {
+        robot.status.pins = Some(Newest {
             value: holding,
             at: Duration::ZERO,
             count: 1,
         });
-        let reason = rehearse(&arm, &status, &proposal(0.5)).unwrap_err();
+        let reason = robot.plan(&proposal(0.5)).unwrap_err();
         assert!(reason.contains("already holds"), "{reason}");
+        robot.now = Duration::from_secs(3);
+        assert!(robot.obstacle().unwrap().contains("joint_states"));
     }
 }

@@ -8,8 +8,8 @@ use nalgebra::Isometry2;
 use pick_place::{PickPlace, PrimitiveSettings};
 
 use crate::{
-    Goal, Operator, OperatorDecision, Proposal, ProposalId, ProposalStatus, Question, Reward,
-    StepOutcome, StepResult,
+    Coverage, Goal, Operator, OperatorDecision, Proposal, ProposalId, ProposalStatus, Question,
+    Reward, StepOutcome, StepResult,
 };
 
 fn proposal(id: u64, stamp_s: u64) -> Proposal {
@@ -46,6 +46,7 @@ fn goal(step_count: u32, stamp_s: u64) -> Goal {
         module: "placing".into(),
         settings: PrimitiveSettings::RIGID,
         image: Arc::new(Heightmap::new(Workspace::RAVENS)),
+        coverage: Coverage::default(),
         previous: None,
     }
 }

@@ -8,8 +8,9 @@ use nalgebra::{Isometry2, Point2, Vector2};
 use pick_place::PrimitiveSettings;
 
 use crate::{
-    Confirmation, FAILED_PICK_RADIUS_M, Goal, Observation, OperatorDecision, PlannerRules,
-    Prediction, Proposal, ProposalId, ProposalPlanner, ProposalStatus, StepOutcome, StepResult,
+    Confirmation, Coverage, FAILED_PICK_RADIUS_M, Goal, Observation, OperatorDecision,
+    PlannerRules, Prediction, Proposal, ProposalId, ProposalPlanner, ProposalStatus, StepOutcome,
+    StepResult,
 };
 
 const REJECTED_RADIUS_M: f64 = 0.02;
@@ -35,6 +36,7 @@ fn heightmap(stamp_s: u64, height_m: f32) -> Observation {
         stamp: Duration::from_secs(stamp_s),
         frame: "world".into(),
         heightmap: Arc::new(heightmap),
+        coverage: Coverage::default(),
     }
 }
 
@@ -50,6 +52,7 @@ fn goal(step: u32, attempt: u32, stamp_s: u64) -> Goal {
         module: "placing".into(),
         settings: PrimitiveSettings::RIGID,
         image: heightmap(0, 0.01 * step as f32).heightmap,
+        coverage: Coverage::default(),
         previous: Some(heightmap(0, 0.01 * (step - 1) as f32).heightmap),
     }
 }

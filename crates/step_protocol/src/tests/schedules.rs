@@ -16,10 +16,10 @@ use rand_chacha::ChaCha8Rng;
 
 use crate::mutation::{Mutation, plant};
 use crate::{
-    ApprovalGate, Change, Confirmation, GateAction, GateRules, Goal, GoalSequence, GoalTracker,
-    Job, Judgement, Observation, Operator, OperatorDecision, PlannerRules, Prediction, Proposal,
-    ProposalId, ProposalPlanner, ProposalStatus, Proposed, Question, Reward, RobotState, ShownStep,
-    StepJudge, StepOutcome, StepResult, goals_of,
+    ApprovalGate, Change, Confirmation, Coverage, GateAction, GateRules, Goal, GoalSequence,
+    GoalTracker, Job, Judgement, Observation, Operator, OperatorDecision, PlannerRules, Prediction,
+    Proposal, ProposalId, ProposalPlanner, ProposalStatus, Proposed, Question, Reward, RobotState,
+    ShownStep, StepJudge, StepOutcome, StepResult, goals_of,
 };
 
 const WORKSPACE: Workspace = Workspace {
@@ -214,7 +214,7 @@ fn tracker() -> GoalTracker {
         after: image(1.0 + index as f32),
     };
     let steps: Vec<_> = (0..GOALS).map(shown).collect();
-    let sequence = goals_of("p", 1, image(0.0), &steps);
+    let sequence = goals_of("p", "p/1", image(0.0), &steps);
     let sequence = sequence.unwrap_or_else(|_| GoalSequence::default());
     GoalTracker::new(sequence, StepJudge::Operator)
 }
@@ -284,6 +284,7 @@ impl World {
                 stamp: Duration::from_secs(1),
                 frame: "world".into(),
                 heightmap: heightmap(0.0),
+                coverage: Coverage::default(),
             },
             latched_goal: None,
             latched_proposals: [None, None],

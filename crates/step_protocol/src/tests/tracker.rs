@@ -10,7 +10,7 @@ use pick_place::{PickPlace, PrimitiveSettings};
 use proptest::prelude::*;
 
 use crate::{
-    Capture, CaptureError, Change, Confirmation, ConfirmationRefusal, Goal, GoalSequence,
+    Capture, CaptureError, Change, Confirmation, ConfirmationRefusal, Coverage, Goal, GoalSequence,
     GoalTracker, OperatorDecision, Proposal, ProposalId, ProposalStatus, StepJudge, StepOutcome,
     StepResult,
 };
@@ -41,6 +41,7 @@ fn goal_of_step(problem: &str, step: u32, step_count: u32) -> Goal {
         module: "placing".into(),
         settings: PrimitiveSettings::RIGID,
         image: image(-1.0),
+        coverage: Coverage::default(),
         previous: None,
     }
 }
@@ -407,6 +408,7 @@ fn another_sequence_starts_at_its_first_goal() {
 fn capture(height_m: f32, append: bool) -> Capture {
     Capture {
         image: image(height_m),
+        coverage: Coverage::default(),
         append,
         module: String::new(),
         settings: None,

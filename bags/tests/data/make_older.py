@@ -48,9 +48,7 @@ def goal(step, stamp):
 
 def proposal(identifier, step, stamp):
     pick, place = POSE(0.3, 0.01 * identifier, 0.0), POSE(0.4, 0.1, 1.0)
-    return ours("PickPlace")(
-        header(stamp), identifier, "placing", step, 0, pick, place, 0.75, 0.5, SETTINGS, "placing"
-    )
+    return ours("PickPlace")(header(stamp), identifier, "placing", step, 0, pick, place, 0.75, 0.5, SETTINGS, "placing")
 
 
 def said(identifier, decision):

@@ -495,7 +495,7 @@ impl Executor<'_> {
         let decision = match convert::confirmation_from_msg(&message) {
             Ok(confirmation) => confirmation.decision,
             Err(refusal) => {
-                self.confirmations.reject(&refusal);
+                self.confirmations.reject(refusal);
                 self.report(self.refusal(id, refusal.to_string()), None);
                 return;
             }

@@ -34,6 +34,12 @@ pub fn command(program: impl AsRef<OsStr>) -> Command {
 /// torch-sys, ring and what uses them again each time.
 pub fn cargo() -> Command {
     let mut command = command(std::env::var_os("CARGO").unwrap_or_else(|| "cargo".into()));
+    without_cargo_variables(&mut command);
+    command
+}
+
+/// Takes from a command what Cargo told this process of itself.
+pub fn without_cargo_variables(command: &mut Command) {
     if std::env::var_os("LIBTORCH")
         .is_some_and(|dir| Path::new(&dir) == repository_root().join(".libtorch"))
     {
@@ -45,7 +51,6 @@ pub fn cargo() -> Command {
             command.env_remove(&name);
         }
     }
-    command
 }
 
 /// Runs a command with its output passed through.

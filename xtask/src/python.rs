@@ -1,6 +1,8 @@
 //! The Python on this machine, and the virtual environment of the end-to-end tests: rclpy, our messages, pytest.
 
-use crate::command::{command, output, repository_root, run};
+use crate::command::{
+    command, output, repository_root, run, target_directory, without_cargo_variables,
+};
 use anyhow::{Context as _, Result, bail, ensure};
 use std::fs;
 use std::path::{Path, PathBuf};
@@ -63,6 +65,72 @@ pub fn lint() -> Result<()> {
         run(environment.python()?.args(["-m", "ruff"]).args(check))?;
     }
     Ok(())
+}
+
+/// Installs the package of `python/` as a user does, with pip into a fresh environment, and what its tests need; returns the
+/// environment's Python. That of a Python with PyTorch, where there is one, sees it: the networks are tested too.
+pub fn install_package() -> Result<PathBuf> {
+    let base = match with_pytorch() {
+        Some(python) if fits_package(&python).is_ok() => python,
+        _ => for_package()?,
+    };
+    let prefix = target_directory().join("multiravens-venv");
+    if prefix.exists() {
+        fs::remove_dir_all(&prefix)
+            .with_context(|| format!("cannot remove the old {}", prefix.display()))?;
+    }
+    output(
+        command(&base)
+            .args(["-m", "venv", "--system-site-packages"])
+            .arg(&prefix),
+    )
+    .context("cannot make a virtual environment (Debian and Ubuntu: apt install python3-venv)")?;
+    let python = prefix.join("bin/python");
+    println!("python: installing multiravens for {} ...", base.display());
+    let pip = [
+        "-m",
+        "pip",
+        "install",
+        "--quiet",
+        "--disable-pip-version-check",
+    ];
+    run(command(&python)
+        .args(pip)
+        .args(["-r", "python/tests/requirements.txt"]))?;
+    // As from a shell: what Cargo says of xtask would have dependencies compiled again.
+    let mut install = command(&python);
+    without_cargo_variables(&mut install);
+    run(install.args(pip).arg("./python"))?;
+    Ok(python)
+}
+
+/// Checks that the package can be installed for this Python.
+fn fits_package(python: &Path) -> Result<()> {
+    let minor = minor_version(python).context("does not run")?;
+    ensure!(minor >= 10, "is Python 3.{minor}, expected 3.10 or newer");
+    output(command(python).args(["-c", "import ensurepip, venv"]))
+        .context("has no venv (Debian and Ubuntu: apt install python3-venv)")?;
+    Ok(())
+}
+
+/// The first Python here that the package can be installed for.
+fn for_package() -> Result<PathBuf> {
+    let names = [
+        "python3",
+        "/usr/bin/python3",
+        "python3.13",
+        "python3.12",
+        "python3.11",
+        "python3.10",
+    ];
+    let mut reasons = String::new();
+    for name in names {
+        match fits_package(Path::new(name)) {
+            Ok(()) => return Ok(name.into()),
+            Err(error) => reasons += &format!("\n  {name}: {error:#}"),
+        }
+    }
+    bail!("the package multiravens needs Python 3.10 or newer with venv; none was found:{reasons}")
 }
 
 /// The 11 of Python 3.11.

@@ -28,6 +28,8 @@ pub enum Stage {
     EndToEnd,
     /// The table of docs/ros2.md against rclpy of ROS 2 Kilted too
     Kilted,
+    /// The Python package multiravens: installed by pip into a fresh environment, then pytest in python/tests
+    Multiravens,
 }
 
 impl Stage {
@@ -100,6 +102,13 @@ impl Stage {
                 run(environment
                     .python()?
                     .args(["-m", "pytest", "tests/test_ros2.py"])
+                    .args(pytest_arguments))
+            }
+            Self::Multiravens => {
+                build_programs()?;
+                let python = python::install_package()?;
+                run(command(python)
+                    .args(["-m", "pytest", "-c", "python/pytest.ini", "python/tests"])
                     .args(pytest_arguments))
             }
         }

@@ -1,0 +1,529 @@
+"""Checkpoints of SCTN in PyTorch: the networks with the weights' own names, and the decision that the Rust side makes.
+
+>>> from multiravens.network import Policy
+>>> policy = Policy.load("config/checkpoints/ten_problems.safetensors")
+>>> action = policy.decide(observation).action  # observation of a MultiRavens environment
+
+:class:`Network` is a plain module: its parameters can be trained further, frozen or copied. This file needs PyTorch and numpy,
+nothing else of the package.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import struct
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import nn
+
+Config = Mapping[str, Any]
+Image = Mapping[str, Any]
+
+_KINDS = {"F64": "<f8", "F32": "<f4", "F16": "<f2"}
+_GOALS = {"next_step": ("goal",), "final": ("goal",), "both": ("goal", "last_goal"), "sequence": ("goal", "previous_goal")}
+_DEFAULTS: dict[str, dict[str, Any]] = {
+    "compact": {
+        "channels": [16, 32, 64, 128],
+        "blocks": [1, 1, 1, 2],
+        "feature_channels": 8,
+        "window_cells": 25,
+        "rotation_sampling": "bilinear",
+    },
+    "gr_convnet": {"channels": 32, "blocks": 5, "feature_channels": 8, "window_cells": 25, "rotation_sampling": "bilinear"},
+    "matching": {
+        "channels": [16, 32, 64, 96],
+        "blocks": [1, 1, 1, 2],
+        "hidden_channels": 24,
+        "appearance_channels": 16,
+        "feature_channels": 6,
+        "context_channels": 4,
+        "window_cells": 21,
+        "rotation_sampling": "bilinear",
+    },
+    "resnet43": {"crop_px": 64, "feature_channels": 3, "rotation_sampling": "nearest"},
+}
+# Mean and standard deviation of colour (as a fraction) and height (m) in Ravens, which the published network is fed with.
+_COLOR, _HEIGHT_M = (0.18877631, 0.07276466), (0.00509261, 0.00903967)
+
+
+class CheckpointError(ValueError):
+    """A file that is no checkpoint, or one of another network."""
+
+
+class Features(NamedTuple):
+    """What a network says of one input: logits of picks, and the features that places are found by."""
+
+    pick: torch.Tensor
+    """Logits of picks, rows x cols of the grid."""
+    query: torch.Tensor
+    """Features whose window at the pick is turned, channels x rows x cols."""
+    key: torch.Tensor
+    """Features that the windows are correlated with, half a window wider on each side."""
+    scale: torch.Tensor | float
+    """Factor from correlation to logit."""
+    place: torch.Tensor | None
+    """Of ``matching``: logits of places whatever the pick, rows x cols."""
+    done: torch.Tensor | None
+    """Of ``matching``: logit that the step is done already."""
+
+
+class Decision(NamedTuple):
+    """Where to pick and where to place."""
+
+    action: Any
+    """x (m), y (m), yaw (rad) of the pick, then of the place: float64, (6,)."""
+    pick_score: float
+    """Probability of the picked cell."""
+    place_score: float
+    """Probability of the placed cell and rotation."""
+    done: float | None
+    """Probability that the step is done already, of a network that says so."""
+    success: float | None
+    """Probability that the step earns its reward, of a checkpoint with a calibration."""
+    pick_map: Any
+    """Probabilities of pick cells: float32, rows x cols of the grid."""
+    place_map: Any
+    """Probabilities of place cells at the rotation decided on: float32, rows x cols of the grid."""
+
+
+def read_safetensors(path: str | os.PathLike[str]) -> tuple[dict[str, torch.Tensor], dict[str, str]]:
+    """Tensors by name, and the metadata."""
+    try:
+        with open(path, "rb") as file:
+            data = file.read()
+        (size,) = struct.unpack("<Q", data[:8])
+        header = json.loads(data[8 : 8 + size])
+        metadata = header.pop("__metadata__", {})
+        tensors = {}
+        for name, entry in header.items():
+            start, end = (8 + size + offset for offset in entry["data_offsets"])
+            if end > len(data):
+                raise CheckpointError(f"{path}: a truncated safetensors file, {name} ends at byte {end} of {len(data)}")
+            numbers = np.frombuffer(data[start:end], _KINDS[entry["dtype"]]).reshape(entry["shape"])
+            tensors[name] = torch.from_numpy(numbers.copy())
+    except CheckpointError:
+        raise
+    except OSError as error:
+        raise CheckpointError(f"{path}: {error.strerror}") from error
+    except (struct.error, ValueError, KeyError, TypeError, AttributeError) as error:
+        raise CheckpointError(f"{path}: no safetensors file, or a truncated one: {error!r}") from error
+    return tensors, metadata
+
+
+def complete(config: Config) -> dict[str, Any]:
+    """A configuration with what it leaves out, as the Rust side reads it."""
+    kind = config["network"]["kind"]
+    if kind not in _DEFAULTS:
+        raise CheckpointError(f"network.kind: is {kind!r}, expected one of {sorted(_DEFAULTS)}")
+    whole = {"rows": 320, "cols": 160, "pixel_size_m": 0.003125, "rotations": 36, "conditioning": "next_step", **config}
+    if whole["conditioning"] not in _GOALS:
+        raise CheckpointError(f"conditioning: is {whole['conditioning']!r}, expected one of {sorted(_GOALS)}")
+    return {**whole, "network": {**_DEFAULTS[kind], **config["network"]}}
+
+
+def _channels(config: Config) -> int:
+    goals = len(_GOALS[config["conditioning"]])
+    return {"resnet43": 4 + 4 * goals, "matching": 24}.get(config["network"]["kind"], 4 + 10 * goals)
+
+
+def shapes(config: Config) -> dict[str, tuple[int, ...]]:
+    """The shape of each weight of a complete configuration, by its name in checkpoints."""
+    found: dict[str, tuple[int, ...]] = {}
+    network, inputs = config["network"], _channels(config)
+
+    def conv(name: str, before: int, after: int, kernel: int) -> None:
+        found[f"{name}.weight"] = (after, before, kernel, kernel)
+        found[f"{name}.bias"] = (after,)
+
+    def block(name: str, size: int) -> None:
+        conv(f"{name}.first", size, size, 3)
+        conv(f"{name}.second", size, size, 3)
+
+    def unet(sizes: Sequence[int], blocks: Sequence[int]) -> None:
+        for level, (size, count) in enumerate(zip(sizes, blocks, strict=True)):
+            conv(f"level{level}.down" if level else "stem", sizes[level - 1] if level else inputs, size, 3 if level else 4)
+            for index in range(count):
+                block(f"level{level}.block{index}", size)
+        for level in (2, 1, 0):
+            conv(f"rise{level}.lateral", sizes[level + 1], sizes[level], 1)
+            block(f"rise{level}.block", sizes[level])
+
+    def hourglass(name: str, before: int, after: int) -> None:
+        conv(f"{name}.stem", before, 64, 3)
+        size = 64
+        plan = [(64, 64), (128, 128), (256, 256), (512, 512), (256, 256), (128, 128), (64, 64), (16, after)]
+        for stage, (hidden, out) in enumerate(plan):
+            for part in "ab":
+                at = f"{name}.stage{stage}.{part}"
+                conv(f"{at}.first", size, hidden, 1)
+                conv(f"{at}.second", hidden, hidden, 3)
+                conv(f"{at}.third", hidden, out, 1)
+                if part == "a":
+                    conv(f"{at}.shortcut", size, out, 1)
+                size = out
+
+    if network["kind"] == "resnet43":
+        goals = len(_GOALS[config["conditioning"]])
+        hourglass("pick", 6 + 6 * goals, 1)
+        for name, before in (("query", 6), ("key", 6), ("goal", 6 * goals)):
+            hourglass(name, before, network["feature_channels"])
+        return found
+    if network["kind"] == "gr_convnet":
+        width = network["channels"]
+        sizes = [inputs, width, 2 * width, 4 * width]
+        for index in range(3):
+            conv(f"down{index}", sizes[index], sizes[index + 1], 4)
+        for index in range(network["blocks"]):
+            block(f"block{index}", sizes[3])
+        for index in range(2):
+            conv(f"up{index}", sizes[3 - index], sizes[2 - index], 3)
+    else:
+        width = network["channels"][0]
+        unet(network["channels"], network["blocks"])
+    found["scale"] = (1,)
+    if network["kind"] != "matching":
+        conv("heads", width, 3 * width, 3)
+        for name, size in (("pick", 1), ("query", network["feature_channels"]), ("key", network["feature_channels"])):
+            conv(name, width, size, 1)
+        return found
+    found["match_scale"] = (1,)
+    hidden = network["hidden_channels"]
+    conv("embedding.first", 4, hidden, 4)
+    conv("embedding.second", hidden, hidden, 3)
+    conv("embedding.third", hidden, network["appearance_channels"] + network["feature_channels"], 3)
+    conv("heads", width, 5 * width, 3)
+    context = network["context_channels"]
+    for name, size in (("place", 1), ("bias", 1), ("query", context), ("key", context), ("gate", 1), ("done", 1)):
+        conv(name, width, size, 1)
+    return found
+
+
+def encode(config: Config, observation: Image, *goals: Image) -> torch.Tensor:
+    """What a network reads of an observation and its goals (``color``, uint8, and ``height``, m): float32, 1 x channels x rows x cols."""
+
+    def cells(image: Image) -> torch.Tensor:
+        color = torch.as_tensor(np.array(image["color"], np.float32))
+        height = torch.as_tensor(np.array(image["height"], np.float32))
+        return torch.cat([color.permute(2, 0, 1), height[None]])
+
+    raw = [cells(image) for image in (observation, *goals)]
+    kind = config["network"]["kind"]
+    if kind == "resnet43":
+        return torch.cat(raw)[None]
+    # Heights of 40 mm, the edge of a block, count as much as half the range of a colour.
+    scaled = [torch.cat([image[:3] * (1 / 128) - 1.1, image[3:] * (1 / 0.04)]) for image in raw]
+
+    def sizes(change: torch.Tensor) -> torch.Tensor:
+        return torch.stack([change[:3].abs().sum(0) * (1 / 3), change[3].abs()])
+
+    seen, wanted = scaled[0], scaled[1:]
+    if kind == "matching":
+        goal, previous = wanted
+        changes = [goal - previous, goal - seen]
+        return torch.cat([seen, previous, goal, *changes, *map(sizes, changes)])[None]
+    parts = [part for goal in wanted for part in (goal, goal - seen, sizes(goal - seen))]
+    return torch.cat([seen, *parts])[None]
+
+
+class Network(nn.Module):
+    """A network of a configuration, as it stands under ``network`` in the head of a checkpoint; its weights start at random."""
+
+    def __init__(self, config: Config) -> None:
+        super().__init__()
+        self.config = complete(config)
+        for name, shape in shapes(self.config).items():
+            *path, last = name.split(".")
+            owner: nn.Module = self
+            for part in path:
+                if not hasattr(owner, part):
+                    owner.add_module(part, nn.Module())
+                owner = getattr(owner, part)
+            weight = nn.Parameter(torch.empty(shape))
+            if len(shape) == 4:
+                nn.init.kaiming_uniform_(weight, a=math.sqrt(5))
+            else:
+                nn.init.constant_(weight, 10.0 if last == "match_scale" else 0.01 if last == "scale" else 0.0)
+            owner.register_parameter(last, weight)
+
+    @property
+    def stride(self) -> int:
+        """Heightmap cells for a cell of the grid that is answered on."""
+        return 1 if self.config["network"]["kind"] == "resnet43" else 2
+
+    @property
+    def grid(self) -> tuple[int, int]:
+        """Rows and columns of the answer."""
+        return self.config["rows"] // self.stride, self.config["cols"] // self.stride
+
+    def forward(self, read: torch.Tensor) -> Features:
+        """Runs the convolutions on what :func:`encode` makes, of one sample."""
+        kind = self.config["network"]["kind"]
+        if kind == "resnet43":
+            return self._published(read)
+        trunk = self._gr_convnet if kind == "gr_convnet" else self._unet
+        return self._matching(read) if kind == "matching" else self._heads(trunk(read))
+
+    def place_logits(self, features: Features, pick_px: Sequence[float]) -> torch.Tensor:
+        """Logits of places, rotations x rows x cols, of what is picked at x, y in image coordinates (px)."""
+        network, rotations = self.config["network"], self.config["rotations"]
+        size = network["crop_px"] if self.stride == 1 else network["window_cells"]
+        margin = size // 2 if self.stride == 1 else 0
+        center = [coordinate / self.stride - 0.5 + margin for coordinate in pick_px]
+        bilinear = network["rotation_sampling"] == "bilinear"
+        turns = (2 * math.pi * turn / rotations for turn in range(rotations))
+        kernels = torch.stack([window(features.query, center, turn, size, bilinear) for turn in turns])
+        rows, cols = self.grid
+        logits = features.scale * F.conv2d(features.key[None], kernels)[0, :, :rows, :cols]
+        return logits if features.place is None else logits + features.place
+
+    def _weight(self, name: str) -> torch.Tensor:
+        return self.get_parameter(name)
+
+    def _conv(self, name: str, x: torch.Tensor, stride: int = 1) -> torch.Tensor:
+        weight = self._weight(name + ".weight")
+        return F.conv2d(x, weight, self._weight(name + ".bias"), stride, (weight.shape[2] - 1) // 2)
+
+    def _block(self, name: str, x: torch.Tensor) -> torch.Tensor:
+        return F.relu(x + self._conv(f"{name}.second", F.relu(self._conv(f"{name}.first", x))))
+
+    def _unet(self, x: torch.Tensor) -> torch.Tensor:
+        skips = []
+        for level, blocks in enumerate(self.config["network"]["blocks"]):
+            x = F.relu(self._conv(f"level{level}.down" if level else "stem", x, 2))
+            for index in range(blocks):
+                x = self._block(f"level{level}.block{index}", x)
+            skips.append(x)
+        for level in (2, 1, 0):
+            x = _doubled(self._conv(f"rise{level}.lateral", x)) + skips[level]
+            x = self._block(f"rise{level}.block", x)
+        return x
+
+    def _gr_convnet(self, x: torch.Tensor) -> torch.Tensor:
+        for index in range(3):
+            x = F.relu(self._conv(f"down{index}", x, 2))
+        for index in range(self.config["network"]["blocks"]):
+            x = self._block(f"block{index}", x)
+        for index in range(2):
+            x = F.relu(self._conv(f"up{index}", _doubled(x)))
+        return x
+
+    def _heads(self, x: torch.Tensor) -> Features:
+        heads = F.relu(self._conv("heads", x)).chunk(3, 1)
+        pick, query, key = (self._conv(name, head)[0] for name, head in zip(("pick", "query", "key"), heads, strict=True))
+        margin = self.config["network"]["window_cells"] // 2
+        return Features(pick[0], query, F.pad(key, (margin,) * 4), self._weight("scale"), None, None)
+
+    def _matching(self, x: torch.Tensor) -> Features:
+        network = self.config["network"]
+        heads = F.relu(self._conv("heads", self._unet(x))).chunk(5, 1)
+        names = ("place", "bias", "query", "key")
+        place, bias, query, key = (self._conv(name, head)[0] for name, head in zip(names, heads, strict=False))
+        gate, done = torch.sigmoid(self._conv("gate", heads[3]))[0], self._conv("done", heads[4])[0, 0]
+        place = place[0]
+        # The place teaches the embedding what to look like, and not the other way round.
+        attention = torch.softmax(place.detach().flatten(), 0).view_as(place)
+
+        def embedded(image: torch.Tensor) -> Sequence[torch.Tensor]:
+            image = F.relu(self._conv("embedding.first", image, 2))
+            image = self._conv("embedding.third", F.relu(self._conv("embedding.second", image)))[0]
+            vectors, features = image.split([network["appearance_channels"], network["feature_channels"]])
+            return F.normalize(vectors, dim=0, eps=1e-6), features
+
+        seen, seen_features = embedded(x[:, 0:4])
+        shown, shown_features = embedded(x[:, 8:12])
+        moved = F.normalize((shown * attention).sum((1, 2)), dim=0, eps=1e-6)
+        pick = self._weight("match_scale") * torch.einsum("c,cij->ij", moved, seen) + bias[0]
+        query = torch.cat([seen_features, query])
+        key = torch.cat([shown_features * gate, key])
+        margin = network["window_cells"] // 2
+        return Features(pick, query, F.pad(key, (margin,) * 4), self._weight("scale"), place, (done * attention).sum())
+
+    def _hourglass(self, name: str, x: torch.Tensor) -> torch.Tensor:
+        """ResNet43_8s of Ravens."""
+        x = F.relu(self._conv(f"{name}.stem", x))
+        for stage, stride in enumerate([1, 2, 2, 2, 1, 1, 1, 1]):
+            for part in "ab":
+                at = f"{name}.stage{stage}.{part}"
+                own = stride if part == "a" else 1
+                y = F.relu(self._conv(f"{at}.first", x, own))
+                y = self._conv(f"{at}.third", F.relu(self._conv(f"{at}.second", y)))
+                x = y + (self._conv(f"{at}.shortcut", x, own) if part == "a" else x)
+                if stage < 7:
+                    x = F.relu(x)
+            if stage in (4, 5, 6):
+                x = _doubled(x)
+        return x
+
+    def _published(self, read: torch.Tensor) -> Features:
+        def image(cells: torch.Tensor, rows: int, cols: int) -> torch.Tensor:
+            # Padding comes before normalising: outside is black and at height 0.
+            cells = F.pad(cells, (cols, cols, rows, rows))
+            color, height = (cells[:, :3] / 255 - _COLOR[0]) / _COLOR[1], (cells[:, 3:] - _HEIGHT_M[0]) / _HEIGHT_M[1]
+            return torch.cat([color, height, height, height], 1)
+
+        observation, *goals = read.split(4, 1)
+        rows, cols = self.config["rows"], self.config["cols"]
+        # The pick net reads a square.
+        top, left = ((max(rows, cols) - size) // 2 for size in (rows, cols))
+        stacked = torch.cat([image(seen, top, left) for seen in (observation, *goals)], 1)
+        pick = self._hourglass("pick", stacked)[0, 0, top : top + rows, left : left + cols]
+        half = self.config["network"]["crop_px"] // 2
+        seen = image(observation, half, half)
+        goal = self._hourglass("goal", torch.cat([image(goal, half, half) for goal in goals], 1))
+        query, key = ((self._hourglass(name, seen) * goal)[0] for name in ("query", "key"))
+        return Features(pick, query, key, (2 * half) ** -2.0, None, None)
+
+
+def _doubled(x: torch.Tensor) -> torch.Tensor:
+    return F.interpolate(x, scale_factor=2, mode="bilinear", align_corners=False)
+
+
+def _cells(features: torch.Tensor, rows: torch.Tensor, cols: torch.Tensor) -> torch.Tensor:
+    """The features of cells, zero outside."""
+    inside = (rows >= 0) & (rows < features.shape[1]) & (cols >= 0) & (cols < features.shape[2])
+    found = features[:, rows.clamp(0, features.shape[1] - 1), cols.clamp(0, features.shape[2] - 1)]
+    return torch.where(inside, found, torch.zeros((), dtype=features.dtype))
+
+
+def window(features: torch.Tensor, center: Sequence[float], angle: float, size: int, bilinear: bool) -> torch.Tensor:
+    """What an object looks like that was turned by ``angle`` after it was picked at ``center`` (x, y in cells)."""
+    offsets = torch.arange(size, dtype=torch.float64) - size // 2
+    v, u = torch.meshgrid(offsets, offsets, indexing="ij")
+    # Where the turned object now is at (u, v), the lying one was at R(-angle) (u, v).
+    x = center[0] + math.cos(angle) * u + math.sin(angle) * v
+    y = center[1] - math.sin(angle) * u + math.cos(angle) * v
+    if not bilinear:
+        # Half way between two cells the even one is taken, whatever the last bit.
+        row, col = (torch.round(torch.round(at * 1e9) / 1e9).long() for at in (y, x))
+        return _cells(features, row, col)
+    row, col = torch.floor(y).long(), torch.floor(x).long()
+    down, right = (y - row).to(features.dtype), (x - col).to(features.dtype)
+    return (
+        (1 - down) * (1 - right) * _cells(features, row, col)
+        + (1 - down) * right * _cells(features, row, col + 1)
+        + down * (1 - right) * _cells(features, row + 1, col)
+        + down * right * _cells(features, row + 1, col + 1)
+    )
+
+
+class Policy:
+    """A network with the weights of a checkpoint, what its maker wrote about it, and its calibration."""
+
+    def __init__(self, network: Network, card: Mapping[str, str], calibration: Sequence[float] | None = None) -> None:
+        self.network = network
+        self.card = dict(card)
+        self.calibration = calibration
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> Policy:
+        """Reads a checkpoint; refuses another format, missing, further and misshapen tensors, and numbers that are not finite."""
+        tensors, metadata = read_safetensors(path)
+        try:
+            head = json.loads(metadata["gctn"])
+            for key, expected in (("format", "gctn-checkpoint"), ("version", "1")):
+                if head.get(key) != expected:
+                    raise CheckpointError(f"{path}: {key} is {head.get(key)!r}, expected {expected!r}")
+            network = Network(json.loads(head["network"]))
+            card = json.loads(head["card"])
+            calibration = json.loads(head["calibration"])["weights"] if "calibration" in head else None
+        except CheckpointError as error:
+            prefix = "" if str(error).startswith(str(path)) else f"{path}: "
+            raise CheckpointError(f"{prefix}{error}") from error
+        except (KeyError, ValueError, TypeError) as error:
+            raise CheckpointError(f'{path}: "gctn" in its metadata: {error!r}, expected the head of a checkpoint') from error
+        expected_shapes = shapes(network.config)
+        for name in tensors.keys() - expected_shapes.keys():
+            raise CheckpointError(f"{path}: tensor {name}: the configured network has no such tensor")
+        for name, shape in expected_shapes.items():
+            if name not in tensors:
+                raise CheckpointError(f"{path}: tensor {name}: missing, though the configured network has it")
+            if tuple(tensors[name].shape) != shape:
+                raise CheckpointError(f"{path}: tensor {name}: shape {tuple(tensors[name].shape)}, expected {shape}")
+            if not torch.isfinite(tensors[name]).all():
+                raise CheckpointError(f"{path}: tensor {name}: has numbers that are not finite")
+        network.load_state_dict({name: tensor.float() for name, tensor in tensors.items()})
+        return cls(network.eval(), card, calibration)
+
+    @property
+    def conditioning(self) -> str:
+        """Which images it is shown as its goal: ``next_step``, ``final``, ``both`` or ``sequence``."""
+        return str(self.network.config["conditioning"])
+
+    @torch.no_grad()
+    def decide(self, observation: Image, exclude: Iterable[Sequence[float]] = (), radius_m: float = 0.02) -> Decision:
+        """Where to pick and to place. ``observation`` is that of an environment: ``color``, ``height`` and the goals that the
+        network is conditioned on. Picks within ``radius_m`` of the excluded ones (x, y in metres) are left out."""
+        net = self.network
+        config, stride = net.config, net.stride
+        images = [observation]
+        for name in _GOALS[config["conditioning"]]:
+            if name not in observation:
+                raise ValueError(f"observation: has no {name!r}, expected it for the conditioning {config['conditioning']!r}")
+            images.append(observation[name])
+        for image in images:
+            size, expected = np.shape(image["height"]), (config["rows"], config["cols"])
+            if size != expected:
+                raise ValueError(f"observation: heights of the shape {size}, expected {expected}")
+            if not np.isfinite(image["height"]).all():
+                raise ValueError("observation: has heights that are not finite")
+        features = net(encode(config, *images))
+        rows, cols = net.grid
+        y, x = np.mgrid[:rows, :cols]
+        x_px, y_px = (x + 0.5) * stride, (y + 0.5) * stride
+        pixel = config["pixel_size_m"]
+
+        picks = features.pick.double().numpy().copy()
+        for point in exclude:
+            away = np.hypot(x_px - (point[0] - 0.25) / pixel, y_px - (point[1] + 0.5) / pixel)
+            picks[away <= radius_m / pixel] = -np.inf
+        if not np.isfinite(picks.max()):
+            raise ValueError("exclude: leaves nothing to pick, expected fewer or a smaller radius_m")
+        row, col = divmod(int(picks.argmax()), cols)
+        pick_px = [float(x_px[row, col]), float(y_px[row, col])]
+        pick_map = np.exp(picks - picks.max())
+        pick_map = (pick_map / pick_map.sum()).astype(np.float32)
+
+        places = net.place_logits(features, pick_px).double().numpy()
+        turn, to_row, to_col = (int(index) for index in np.unravel_index(places.argmax(), places.shape))
+        log_sum = places.max() + math.log(np.exp(places - places.max()).sum())
+        place_map = np.minimum(np.exp(places[turn] - log_sum), 1.0).astype(np.float32)
+        offset = [0.0, 0.0] if stride == 1 else [_between(places[turn, to_row], to_col), _between(places[turn, :, to_col], to_row)]
+        place_px = [(to_col + offset[0] + 0.5) * stride, (to_row + offset[1] + 0.5) * stride]
+        yaw = 2 * math.pi * turn / config["rotations"]
+        yaw = yaw - 2 * math.pi if yaw > math.pi else yaw
+
+        done = None if features.done is None else float(torch.sigmoid(features.done))
+        near = [
+            float(np.clip(scores[np.hypot(x_px - at[0], y_px - at[1]) <= 4.0].astype(float).sum(), 1e-6, 1.0))
+            for scores, at in ((pick_map, pick_px), (place_map, place_px))
+        ]
+        success = None
+        if self.calibration is not None:
+            odds = 0.0 if done is None else float(np.clip(math.log(max(done, 1e-30) / max(1 - done, 1e-30)), -12.0, 12.0))
+            said = [1.0, math.log(near[0]), math.log(near[1]), odds]
+            success = 1 / (1 + math.exp(-sum(weight * part for weight, part in zip(self.calibration, said, strict=True))))
+        poses = [(0.25 + px * pixel, -0.5 + py * pixel) for px, py in (pick_px, place_px)]
+        return Decision(
+            np.array([*poses[0], 0.0, *poses[1], yaw]),
+            float(pick_map[row, col]),
+            float(place_map[to_row, to_col]),
+            done,
+            success,
+            pick_map,
+            place_map,
+        )
+
+
+def _between(logits: Any, index: int) -> float:
+    """Where between cells the maximum lies: labels are Gaussians, so logarithms of probabilities are parabolas."""
+    if index == 0 or index + 1 == len(logits):
+        return 0.0
+    before, here, after = (float(logits[index + step]) for step in (-1, 0, 1))
+    curvature = before - 2 * here + after
+    return float(np.clip(0.5 * (before - after) / curvature, -0.5, 0.5)) if curvature < 0 else 0.0

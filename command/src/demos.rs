@@ -5,6 +5,7 @@ use crate::progress;
 use crate::root::Root;
 use anyhow::{Context, Result, bail};
 use bags::Demonstration;
+use camera_noise::Perturbation;
 use clap::Args;
 use cpu_time::ProcessTime;
 use learning::{demonstrate, demonstrate_disturbed, demonstration_path, replay, wilson_95};
@@ -35,9 +36,13 @@ pub struct Demos {
     /// demonstration, which goes on from what came of it. With --starts the demonstration that sets the order stays clean
     #[arg(long, default_value_t = 0.0, value_parser = probability)]
     disturb: f64,
+    /// What the cameras do to the images, a file as those of config/perturbations; each start is a session of the cameras of its own
+    /// [default: perfect cameras]
+    #[arg(long)]
+    perturb: Option<PathBuf>,
     /// Draw instead, into this folder: the problem [default: all], its demonstration of the seed
     /// [default: 0] as pictures and an animation
-    #[arg(long, conflicts_with_all = ["episodes", "out", "threads", "json"])]
+    #[arg(long, conflicts_with_all = ["episodes", "perturb", "out", "threads", "json"])]
     gallery: Option<PathBuf>,
     /// Folder for the bags, DIR/PROBLEM/SEED each, or DIR/PROBLEM/SEED_START from another start; those already there are kept [default: none are written]
     #[arg(long)]
@@ -89,6 +94,8 @@ impl Demos {
         let first_seed = self.seed.context("--seed is missing")?;
         let problem = root.problem(name)?;
         let work_cell = root.work_cell()?;
+        let perturbation = self.perturb.as_deref().map(Perturbation::load);
+        let perturbation = perturbation.transpose()?;
         let cores = std::thread::available_parallelism().map_or(1, |cores| cores.get());
         let threads = self.threads.unwrap_or(cores).max(1);
         let bar = progress::bar(count * self.starts, "demonstrations");
@@ -98,6 +105,7 @@ impl Demos {
         let episodes = Mutex::new(Vec::new());
         let work = || -> Result<()> {
             let mut environment = Environment::new(&problem, &work_cell);
+            environment.set_perturbation(perturbation.as_ref());
             while !stop.load(Ordering::Relaxed) {
                 let index = next.fetch_add(1, Ordering::Relaxed);
                 if index >= count {
@@ -205,6 +213,7 @@ impl Demos {
             episode.bytes = size(path)?;
             return Ok(episode);
         }
+        environment.set_session(start);
         let known = order.as_deref().unwrap_or_default();
         let leads = self.starts > 1 && order.is_none();
         let disturb = if leads { 0.0 } else { self.disturb };

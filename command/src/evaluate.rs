@@ -8,10 +8,10 @@ use camera_noise::Perturbation;
 use clap::{Args, ValueEnum};
 use gctn::Policy;
 use heightmap::picture::{self, RgbImage};
-use learning::{Actor, Attempt, Episodes, Evaluation, NextStepOracle, Start, evaluate, goal};
+use learning::{Actor, Attempt, Episodes, Evaluation, Start, evaluate, goal};
 use std::path::PathBuf;
 use std::sync::Mutex;
-use step_protocol::FAILED_PICK_RADIUS_M;
+use step_protocol::{FAILED_PICK_RADIUS_M, ReachedGoals};
 
 /// Arguments of `sctn evaluate`.
 #[derive(Args)]
@@ -147,12 +147,17 @@ impl Evaluate {
 fn drawn(policy: &Policy, attempt: &Attempt) -> Result<RgbImage> {
     let goals = attempt.shown.goals();
     let done = &attempt.rollout.demonstration;
-    let mut oracle = NextStepOracle::new(goals.len());
+    let mut oracle = ReachedGoals::new(goals.len());
     let mut rows = Vec::new();
     for (index, step) in done.steps.iter().enumerate() {
         let observation = done.observation(index);
         let first = attempt.shown.observation(0);
-        let goal = goal(first, &goals, oracle.index(), policy.config().conditioning);
+        let goal = goal(
+            first,
+            &goals,
+            oracle.next_index(),
+            policy.config().conditioning,
+        );
         let goal = goal.context("a demonstration without a goal")?;
         let mut images = vec![picture::colors(observation)];
         images.extend(goal.previous.map(picture::colors));
@@ -162,7 +167,8 @@ fn drawn(policy: &Policy, attempt: &Attempt) -> Result<RgbImage> {
         ]);
         let row = picture::side_by_side(&images);
         rows.push(picture::halved(&row));
-        oracle.observe(step.delta_reward);
+        let is_last = index + 1 == done.steps.len();
+        oracle.observe(step.delta_reward, is_last && attempt.rollout.complete);
     }
     // What came of the last step.
     rows.push(picture::halved(&picture::colors(&done.last)));

@@ -96,15 +96,16 @@ impl Goals {
                 let shown = &attempt.shown;
                 let known = known_images(shown);
                 let rollout = &attempt.rollout.demonstration;
+                let complete = attempt.rollout.complete;
                 let mut rng = ChaCha8Rng::seed_from_u64(seed);
                 let embedding = &embedding;
-                for (rollout, count, noise) in [
-                    (shown, &mut report.demonstrator, false),
-                    (shown, &mut report.demonstrator_noise, true),
-                    (rollout, &mut report.policy, false),
-                    (rollout, &mut report.policy_noise, true),
+                for (rollout, complete, count, noise) in [
+                    (shown, true, &mut report.demonstrator, false),
+                    (shown, true, &mut report.demonstrator_noise, true),
+                    (rollout, complete, &mut report.policy, false),
+                    (rollout, complete, &mut report.policy_noise, true),
                 ] {
-                    let seen = reached(rollout, known.len() - 1);
+                    let seen = reached(rollout, known.len() - 1, complete);
                     let seen = seen.map(|(heightmap, reached)| {
                         let mut heightmap = heightmap.clone();
                         if noise {

@@ -3,6 +3,7 @@
 use crate::root::Root;
 use anyhow::{Context, Result, ensure};
 use clap::Args;
+use learning::GENERATED;
 use multiravens::tasks::arranging::generator::Ranges;
 use std::path::PathBuf;
 
@@ -36,7 +37,7 @@ impl Problems {
         std::fs::create_dir_all(&self.out).with_context(|| self.out.display().to_string())?;
         for index in 0..self.count {
             let seed = self.seed + 2 * index;
-            let path = self.out.join(format!("arranged_{seed:06}.yaml"));
+            let path = self.out.join(format!("{GENERATED}{seed:06}.yaml"));
             let text = ranges
                 .generate(seed)
                 .with_context(|| file.display().to_string())?;

@@ -9,7 +9,8 @@ use clap::Args;
 use gctn::{GoalConditioning, ModelCard, Policy};
 use indicatif::HumanDuration;
 use learning::{
-    Actor, DataSet, Episodes, EventFile, Recipe, Start, Training, evaluate, recorded_run,
+    Actor, DataSet, Demonstrations, Episodes, EventFile, Recipe, Start, Training, evaluate,
+    recorded_run,
 };
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
@@ -99,16 +100,21 @@ fn load(demos: &[PathBuf], recipe: &mut Recipe) -> Result<DataSet> {
         let [folder] = demos else {
             bail!("--demos: expected one folder of demonstrations, or recorded runs only");
         };
+        let starts = recipe.network.conditioning == GoalConditioning::Sequence;
         for problem in &recipe.problems {
-            let starts = recipe.network.conditioning == GoalConditioning::Sequence;
-            data.load(folder, problem, recipe.demonstrations, starts)?;
+            let count = recipe.demonstrations.of(problem);
+            let count = count.with_context(|| format!("demonstrations of {problem}: missing"))?;
+            data.load(folder, problem, count, starts)?;
+        }
+        if recipe.generated > 0 {
+            data.load_generated(folder, recipe.generated, starts)?;
         }
         return Ok(data);
     }
     if runs.len() < demos.len() {
         bail!("--demos: recorded runs and other folders cannot be mixed");
     }
-    recipe.demonstrations = runs.len();
+    recipe.demonstrations = Demonstrations::Each(runs.len());
     for run in runs {
         data.load_bag(&run, &recipe.problems)?;
         if let Some((demonstration, left_out)) = Demonstration::read_run(&run)? {

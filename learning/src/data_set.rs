@@ -163,6 +163,9 @@ pub enum DataSetError {
     Sampling(#[from] SamplingError),
 }
 
+/// How the names of the problems begin that `sctn problems` draws; a seed follows.
+pub const GENERATED: &str = "arranged_";
+
 /// Where the demonstration of a problem and seed lies within a folder of demonstrations: in
 /// `PROBLEM/SCENE`, from another start in `PROBLEM/SCENE_START`.
 pub fn demonstration_path(
@@ -239,6 +242,38 @@ impl DataSet {
             }
         }
         Ok(())
+    }
+
+    /// Adds one scene of each of the first `count` problems that `sctn problems` has drawn, in order of their seeds, from a folder
+    /// that `sctn demos` wrote.
+    pub fn load_generated(
+        &mut self,
+        directory: &Path,
+        count: usize,
+        all_starts: bool,
+    ) -> Result<(), DataSetError> {
+        let io = |source| DataSetError::Io {
+            path: directory.to_owned(),
+            source,
+        };
+        let mut names = Vec::new();
+        for entry in std::fs::read_dir(directory).map_err(io)? {
+            let name = entry.map_err(io)?.file_name();
+            let name = name.to_str().filter(|name| name.starts_with(GENERATED));
+            names.extend(name.map(str::to_owned));
+        }
+        if names.len() < count {
+            return Err(DataSetError::TooFew {
+                path: directory.join(format!("{GENERATED}*")),
+                found: names.len(),
+                expected: count,
+            });
+        }
+        names.sort();
+        names
+            .iter()
+            .take(count)
+            .try_for_each(|name| self.load(directory, name, 1, all_starts))
     }
 
     /// Adds the demonstration of one bag, also that of a recorded run, which must be of one of these problems.
@@ -583,6 +618,41 @@ mod tests {
         assert!((900..1100).contains(&done), "{done}");
         let share = own as f64 / of_three as f64;
         assert!((0.2..0.3).contains(&share), "{share}");
+    }
+
+    #[test]
+    fn generated_problems_are_loaded_in_order_of_their_seeds_and_one_scene_of_each() {
+        let folder = tempfile::tempdir().unwrap();
+        for (problem, seed, start_seed) in [
+            ("placing", 0, 0),
+            ("arranged_000004", 0, 0),
+            ("arranged_000002", 0, 0),
+            ("arranged_000002", 0, 2),
+            ("arranged_000002", 2, 2),
+        ] {
+            let mut made = demonstration(&[0.5]);
+            (made.problem, made.seed, made.start_seed) = (problem.into(), seed, start_seed);
+            let scene = EpisodeSeed {
+                scene: seed,
+                start: start_seed,
+            };
+            let path = demonstration_path(folder.path(), problem, scene);
+            std::fs::create_dir_all(path.parent().unwrap()).unwrap();
+            made.write(&path).unwrap();
+        }
+        let load = |count, all_starts| {
+            let mut data = DataSet::default();
+            let loaded = data.load_generated(folder.path(), count, all_starts);
+            loaded.map(|()| (data.len(), data.scene_count()))
+        };
+        assert_eq!(load(1, true).unwrap(), (2, 1));
+        assert_eq!(load(2, true).unwrap(), (3, 2));
+        assert_eq!(load(2, false).unwrap(), (2, 2));
+        let error = load(3, true).unwrap_err().to_string();
+        assert!(
+            error.contains("arranged_*") && error.contains("2 demonstrations, expected 3"),
+            "{error}"
+        );
     }
 
     #[test]

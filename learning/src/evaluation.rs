@@ -1,7 +1,7 @@
 //! Evaluation as in the paper (section VI): completion rate over held-out episodes.
 
 use crate::actor::{Act, Actor, Said};
-use crate::goal::{NextStepOracle, goal};
+use crate::goal::goal;
 use crate::interval::bootstrap_95;
 use crate::rollout::{Rollout, demonstrate, roll_out};
 use bags::Demonstration;
@@ -13,7 +13,7 @@ use std::cell::RefCell;
 use std::sync::Mutex;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Instant;
-use step_protocol::FailedPicks;
+use step_protocol::{FailedPicks, ReachedGoals};
 use ur5::WorkCell;
 
 /// Where the demonstration begins whose images are the goals of an episode.
@@ -195,7 +195,7 @@ pub fn attempt(
     environment.set_session(SESSION_OF_ROLLOUT);
     let goals = shown.demonstration.goals();
     let conditioning = actor.conditioning();
-    let oracle = RefCell::new(NextStepOracle::new(goals.len()));
+    let oracle = RefCell::new(ReachedGoals::new(goals.len()));
     let failed_picks: RefCell<FailedPicks> = RefCell::default();
     let said: RefCell<Option<Act>> = RefCell::default();
     let first = shown.demonstration.observation(0);
@@ -206,7 +206,7 @@ pub fn attempt(
         seed,
         |_, observation| {
             let nearest = observation.nearest(std::iter::once(first).chain(goals.iter().copied()));
-            let (reached, next) = (oracle.borrow().reached(), oracle.borrow().index());
+            let (reached, next) = (oracle.borrow().reached(), oracle.borrow().next_index());
             image_distance_right += usize::from(nearest == Some(reached));
             let Some(wanted) = goal(first, &goals, next, conditioning) else {
                 return Ok(None);
@@ -230,11 +230,12 @@ pub fn attempt(
             Ok(Some(act.action))
         },
         |action, report| {
-            let before = oracle.borrow().index();
-            oracle.borrow_mut().observe(report.delta_reward);
+            let mut oracle = oracle.borrow_mut();
+            let before = oracle.next_index();
+            oracle.observe(report.delta_reward, report.complete);
             let mut failed_picks = failed_picks.borrow_mut();
             failed_picks.record(&action.pick, report.outcome.into());
-            if oracle.borrow().index() != before {
+            if oracle.next_index() != before {
                 failed_picks.forget();
             }
             let said = said.borrow_mut().take().and_then(|act| act.said);

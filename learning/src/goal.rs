@@ -6,39 +6,7 @@
 use bags::Demonstration;
 use gctn::{Goal, GoalConditioning};
 use heightmap::Heightmap;
-
-/// The oracle: counts delta rewards, as the paper's operator does who checks each step.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct NextStepOracle {
-    next: usize,
-    len: usize,
-}
-
-impl NextStepOracle {
-    /// At the start of a demonstration sequence of `len` images.
-    pub fn new(len: usize) -> Self {
-        Self { next: 0, len }
-    }
-
-    /// Index of the next-step goal in the sequence. After the last step it stays at the last image.
-    pub fn index(&self) -> usize {
-        self.next.min(self.len.saturating_sub(1))
-    }
-
-    /// Number of images of the sequence that have been reached.
-    pub fn reached(&self) -> usize {
-        self.next
-    }
-
-    /// Tells of a step's delta reward: a gain advances by one image, a loss steps back by one.
-    pub fn observe(&mut self, delta_reward: f64) {
-        if delta_reward > 0.0 {
-            self.next = (self.next + 1).min(self.len);
-        } else if delta_reward < 0.0 {
-            self.next = self.next.saturating_sub(1);
-        }
-    }
-}
+use step_protocol::ReachedGoals;
 
 /// What a policy is shown of a demonstration that begins with the image `first` and has the sequence `images`, when `next` is
 /// the index of its next-step goal. None of an empty sequence.
@@ -73,14 +41,17 @@ pub fn known_images(shown: &Demonstration) -> Vec<&Heightmap> {
     std::iter::once(first).chain(shown.goals()).collect()
 }
 
-/// What is seen after each step of a rollout, and how many goals the oracle then counts as reached.
+/// What is seen after each step of a rollout, and how many goals the oracle then counts as reached. `complete`: its last step
+/// completed the problem.
 pub fn reached(
     rollout: &Demonstration,
     goal_count: usize,
+    complete: bool,
 ) -> impl Iterator<Item = (&Heightmap, usize)> {
-    let mut oracle = NextStepOracle::new(goal_count);
+    let mut oracle = ReachedGoals::new(goal_count);
+    let count = rollout.steps.len();
     rollout.steps.iter().enumerate().map(move |(index, step)| {
-        oracle.observe(step.delta_reward);
+        oracle.observe(step.delta_reward, complete && index + 1 == count);
         (rollout.observation(index + 1), oracle.reached())
     })
 }
@@ -88,15 +59,6 @@ pub fn reached(
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn only_a_delta_reward_advances_the_goal() {
-        let mut oracle = NextStepOracle::new(3);
-        oracle.observe(0.0);
-        assert_eq!(oracle.index(), 0);
-        oracle.observe(0.5);
-        assert_eq!(oracle.index(), 1);
-    }
 
     #[test]
     fn each_conditioning_is_shown_its_images() {
@@ -122,11 +84,32 @@ mod tests {
     }
 
     #[test]
-    fn after_the_last_step_the_goal_stays() {
-        let mut oracle = NextStepOracle::new(2);
-        for _ in 0..5 {
-            oracle.observe(0.5);
-        }
-        assert_eq!(oracle.index(), 1);
+    fn a_goal_counts_as_reached_after_a_gain_and_no_longer_after_a_loss() {
+        let heightmap = Heightmap::new(heightmap::Workspace::RAVENS);
+        let step = |delta_reward| bags::DemonstrationStep {
+            observation: heightmap.clone(),
+            action: pick_place::PickPlace {
+                pick: nalgebra::Isometry2::identity(),
+                place: nalgebra::Isometry2::identity(),
+            },
+            settings: pick_place::PrimitiveSettings::RIGID,
+            module: "placing".into(),
+            delta_reward,
+            outcome: pick_place::Outcome::Placed,
+        };
+        let rollout = Demonstration {
+            problem: "placing".into(),
+            seed: 0,
+            start_seed: 0,
+            steps: [0.5, 0.0, -0.5, 0.5, 0.5].map(step).to_vec(),
+            last: heightmap.clone(),
+        };
+        let counts = |complete| {
+            let counts = reached(&rollout, 2, complete).map(|(_, reached)| reached);
+            counts.collect::<Vec<_>>()
+        };
+        assert_eq!(counts(true), [1, 1, 0, 1, 2]);
+        // The last image stays the goal until the problem is complete.
+        assert_eq!(counts(false), [1, 1, 0, 1, 1]);
     }
 }

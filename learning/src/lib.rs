@@ -21,16 +21,17 @@ mod training;
 pub use actor::{Act, Actor, Said, difference};
 pub use agent::Agent;
 pub use data_set::{
-    DataSet, DataSetError, DrawRules, DrawnSample, Shown, demonstration_path, recorded_run,
+    DataSet, DataSetError, DrawRules, DrawnSample, GENERATED, Shown, demonstration_path,
+    recorded_run,
 };
 pub use embedding::EmbeddingRecipe;
 pub use evaluation::{
     Attempt, EpisodeReport, Episodes, Evaluation, EvaluationError, SaidStep, Start, attempt,
     evaluate,
 };
-pub use goal::{NextStepOracle, goal, known_images, reached};
+pub use goal::{goal, known_images, reached};
 pub use interval::{bootstrap_95, wilson_95};
-pub use recipe::{Recipe, RecipeError, Validation};
+pub use recipe::{Demonstrations, Recipe, RecipeError, Validation};
 pub use reliability::{Reliability, ReliabilityBin, Unasked, reliability};
 pub use rollout::{
     Rollout, demonstrate, demonstrate_disturbed, demonstrate_in_order, replay, roll_out,

@@ -4,6 +4,7 @@ use crate::data_set::Shown;
 use crate::sampling::{Sampling, SamplingError};
 use gctn::{GoalConditioning, Network, NetworkConfig, TrainingConfig};
 use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 
 /// What to train on what, and how.
@@ -13,7 +14,10 @@ pub struct Recipe {
     /// Problems whose demonstrations are learned from.
     pub problems: Vec<String>,
     /// Demonstrations of each problem.
-    pub demonstrations: usize,
+    pub demonstrations: Demonstrations,
+    /// Problems drawn by `sctn problems` that are learned from too, one scene of each: those with the smallest seeds.
+    #[serde(default, skip_serializing_if = "is_zero")]
+    pub generated: usize,
     /// The network.
     pub network: NetworkConfig,
     /// Checkpoint of the same network whose weights the training begins with, instead of random ones; from where the command runs.
@@ -38,6 +42,30 @@ pub struct Recipe {
     pub snapshots: u64,
     /// How snapshots are compared.
     pub validation: Validation,
+}
+
+/// How many demonstrations are learned from; with the conditioning `sequence` scenes, with all their starts.
+#[derive(Clone, Debug, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(untagged, expecting = "a number, or one for each problem by its name")]
+pub enum Demonstrations {
+    /// So many of each problem.
+    Each(usize),
+    /// By name of the problem.
+    Of(BTreeMap<String, usize>),
+}
+
+impl Demonstrations {
+    /// How many of a problem; `None` of one that is not named.
+    pub fn of(&self, problem: &str) -> Option<usize> {
+        match self {
+            Self::Each(count) => Some(*count),
+            Self::Of(counts) => counts.get(problem).copied(),
+        }
+    }
+}
+
+fn is_zero(count: &usize) -> bool {
+    *count == 0
 }
 
 fn is_default(shown: &Shown) -> bool {
@@ -103,7 +131,7 @@ pub enum RecipeError {
         /// The file.
         path: PathBuf,
         /// Which.
-        field: &'static str,
+        field: String,
         /// Its value.
         value: String,
         /// What was expected.
@@ -126,7 +154,7 @@ pub(crate) fn read_yaml<T: serde::de::DeserializeOwned>(path: &Path) -> Result<T
 /// Refuses a field out of range.
 pub(crate) fn check_field(
     path: &Path,
-    field: &'static str,
+    field: &str,
     good: bool,
     value: String,
     expected: &'static str,
@@ -135,7 +163,7 @@ pub(crate) fn check_field(
         true => Ok(()),
         false => Err(RecipeError::Field {
             path: path.to_owned(),
-            field,
+            field: field.to_owned(),
             value,
             expected,
         }),
@@ -183,12 +211,28 @@ impl Recipe {
             format!("{problems:?}"),
             "at least one",
         )?;
-        field(
-            "demonstrations",
-            *demonstrations > 0,
-            demonstrations.to_string(),
-            "at least 1",
-        )?;
+        for problem in problems {
+            let count = demonstrations.of(problem);
+            let value = count.map_or("missing".into(), |count| count.to_string());
+            check_field(
+                path,
+                &format!("demonstrations of {problem}"),
+                count.is_some_and(|count| count > 0),
+                value,
+                "at least 1",
+            )?;
+        }
+        if let Demonstrations::Of(counts) = demonstrations {
+            for problem in counts.keys() {
+                check_field(
+                    path,
+                    &format!("demonstrations of {problem}"),
+                    problems.contains(problem),
+                    "given".into(),
+                    "only problems of the field problems",
+                )?;
+            }
+        }
         for (name, share) in [
             ("shown.same_start", shown.same_start),
             ("shown.done", shown.done),
@@ -288,6 +332,17 @@ mod tests {
     }
 
     #[test]
+    fn each_problem_may_have_a_number_of_its_own() {
+        let of = |text: &str| serde_yaml_ng::from_str::<Demonstrations>(text);
+        assert_eq!(of("7").unwrap().of("placing"), Some(7));
+        let some = of("{placing: 3, stacking: 9}").unwrap();
+        let counts = ["placing", "stacking", "routing"].map(|problem| some.of(problem));
+        assert_eq!(counts, [Some(3), Some(9), None]);
+        let error = of("many").unwrap_err().to_string();
+        assert!(error.contains("one for each problem"), "{error}");
+    }
+
+    #[test]
     fn a_field_that_is_unknown_or_out_of_range_is_refused_by_name() {
         assert!(changed("snapshots:", "snapshot:").contains("snapshot"));
         assert!(changed("seed: 1}", "seed: 2}").contains("validation.seed is 2"));
@@ -302,7 +357,13 @@ mod tests {
             "the known ones are named"
         );
         assert!(
-            changed("demonstrations: 100", "demonstrations: 0").contains("demonstrations is 0")
+            changed("demonstrations: 100", "demonstrations: 0")
+                .contains("demonstrations of placing is 0")
         );
+        let error = changed("demonstrations: 100", "demonstrations: {stacking: 3}");
+        assert!(error.contains("demonstrations of placing is missing"));
+        let both = "demonstrations: {placing: 3, stacking: 3}";
+        let error = changed("demonstrations: 100", both);
+        assert!(error.contains("demonstrations of stacking is given"));
     }
 }

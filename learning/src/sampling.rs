@@ -188,13 +188,15 @@ impl Sampling {
 }
 
 /// The paper's weights of its four modules: inferred complexity in thousands of gradient steps, and what the
-/// search of its appendix found for the steps (paper, table "Hyperparameters for weighted sampling").
+/// search of its appendix found for the steps (paper, table "Hyperparameters for weighted sampling"). *arranging* is none of
+/// them: as complex as *placing*, its steps alike.
 fn published(module: &str) -> Option<ModuleWeights> {
     let (weight, steps) = match module {
         "placing" => (4.0, StepWeights::Linear { max_weight: 2.76 }),
         "chaining" => (20.0, StepWeights::Last { max_weight: 1.92 }),
         "routing" => (20.0, StepWeights::Linear { max_weight: 1.76 }),
         "stacking" => (12.0, StepWeights::Linear { max_weight: 1.50 }),
+        "arranging" => (4.0, StepWeights::Uniform),
         _ => return None,
     };
     Some(ModuleWeights { weight, steps })

@@ -2,7 +2,7 @@
 
 use crate::agent::Agent;
 use crate::data_set::Shown;
-use crate::recipe::{Recipe, RecipeError, Validation, check_field, read_yaml};
+use crate::recipe::{Demonstrations, Recipe, RecipeError, Validation, check_field, read_yaml};
 use gctn::{NetworkConfig, TrainingConfig};
 use serde::{Deserialize, Serialize};
 use std::path::Path;
@@ -210,7 +210,8 @@ impl Sweep {
     pub fn recipe(&self, run: &Run, modules: usize) -> Recipe {
         Recipe {
             problems: vec![run.problem.clone()],
-            demonstrations: run.demonstrations,
+            demonstrations: Demonstrations::Each(run.demonstrations),
+            generated: 0,
             network: NetworkConfig {
                 conditioning: run.agent.conditioning(),
                 ..self.network.clone()

@@ -147,7 +147,7 @@ impl Training {
 mod tests {
     use super::*;
     use crate::data_set::Shown;
-    use crate::recipe::Validation;
+    use crate::recipe::{Demonstrations, Validation};
     use crate::sampling::Sampling;
     use bags::{Demonstration, DemonstrationStep};
     use gctn::{Compact, Network, NetworkConfig, TrainingConfig};
@@ -158,7 +158,8 @@ mod tests {
     fn recipe(seed: u64) -> Recipe {
         Recipe {
             problems: vec!["placing".into()],
-            demonstrations: 2,
+            demonstrations: Demonstrations::Each(2),
+            generated: 0,
             network: NetworkConfig {
                 rows: 48,
                 cols: 32,

@@ -136,6 +136,8 @@ mod tests {
                     pick: 0.0,
                     place: 0.0,
                     done: 0.0,
+                    pick_focus: 0.0,
+                    place_focus: 0.0,
                 },
                 done: Some(0.2),
                 success: Some(success),

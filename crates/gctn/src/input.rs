@@ -126,7 +126,11 @@ impl<'a> Image<'a> {
         if row as u32 >= self.rows as u32 || col as u32 >= self.cols as u32 {
             return [0.0; 4];
         }
-        let index = row as usize * self.cols + col as usize;
+        self.at(row as usize * self.cols + col as usize)
+    }
+
+    #[inline(always)]
+    fn at(&self, index: usize) -> Cell {
         let rgb = &self.rgb[3 * index..3 * index + 3];
         [
             rgb[0] as f32,
@@ -227,6 +231,14 @@ fn encode_as<const GOALS: usize>(
         }
     };
     let last_col = observation.cols as f32;
+    if *warp == Warp::identity() {
+        let cells = out.chunks_exact_mut(reading.channels(GOALS));
+        for (index, out) in cells.enumerate() {
+            let goals = goals.iter().map(|goal| goal.at(index));
+            reading.write(observation.at(index), goals, out);
+        }
+        return;
+    }
     let cells = out.chunks_exact_mut(reading.channels(GOALS));
     for (index, out) in cells.enumerate() {
         let (row, col) = (index / observation.cols, index % observation.cols);

@@ -235,18 +235,20 @@ impl Policy {
 
     fn place(&self, logits: &Tensor) -> Result<(Point2<f64>, usize, f64, ScoreMap), Error> {
         let grid = &self.model.grid;
-        let log_sum = logits
-            .flatten(0, -1)
-            .logsumexp([0].as_slice(), false)
-            .double_value(&[]);
-        let logits = values(logits, "the place map")?;
-        let best = argmax(&logits);
+        let flat = logits.flatten(0, -1);
+        let log_sum = flat.logsumexp([0].as_slice(), false).double_value(&[]);
+        // Not finite where any of them is not, so that only the maps decided on need to be looked at.
+        if !log_sum.is_finite() {
+            let what = "the place map";
+            return Err(Error::NotFinite { what, step: None });
+        }
+        let best = flat.argmax(0, false).int64_value(&[]) as usize;
         let cells = grid.rows * grid.cols;
         let (rotation, cell) = (best / cells, best % cells);
-        let map = &logits[rotation * cells..(rotation + 1) * cells];
+        let map = values(&logits.get(rotation as i64), "the place map")?;
         let (row, col) = (cell / grid.cols, cell % grid.cols);
         let offset = if grid.subcell {
-            subcell(map, grid.rows, grid.cols, row, col)
+            subcell(&map, grid.rows, grid.cols, row, col)
         } else {
             [0.0; 2]
         };
@@ -256,7 +258,7 @@ impl Policy {
         );
         let score = |logit: f32| (f64::from(logit) - log_sum).exp().min(1.0);
         let scores = map.iter().map(|logit| score(*logit) as f32).collect();
-        Ok((place_px, rotation, score(logits[best]), self.map(scores)))
+        Ok((place_px, rotation, score(map[cell]), self.map(scores)))
     }
 }
 

@@ -203,7 +203,7 @@ fn a_calibrated_checkpoint_decides_the_same_and_says_how_likely_it_is() {
     let (folder, path) = saved(Storage::F16);
     let calibrated = folder.path().join("calibrated.safetensors");
     let calibration = Calibration {
-        weights: [0.5, 0.25, 0.125, -1.0],
+        weights: [0.5, 0.25, 0.125, -1.0, 0.0625, 2.0],
         steps: 60,
     };
     gctn::calibrate(&path, &calibrated, &calibration).unwrap();

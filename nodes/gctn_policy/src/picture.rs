@@ -148,11 +148,7 @@ mod tests {
         Decision {
             done: None,
             success: None,
-            evidence: Evidence {
-                pick: 0.0,
-                place: 0.0,
-                done: 0.0,
-            },
+            evidence: Evidence::default(),
             pick: Isometry2::new(Vector2::new(0.3, -0.4), 0.0),
             place: Isometry2::new(Vector2::new(0.7, 0.4), FRAC_PI_2),
             pick_score: 1.0,

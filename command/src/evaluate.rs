@@ -11,7 +11,7 @@ use heightmap::picture::{self, RgbImage};
 use learning::{Actor, Attempt, Episodes, Evaluation, Start, evaluate, goal};
 use std::path::PathBuf;
 use std::sync::Mutex;
-use step_protocol::{FAILED_PICK_RADIUS_M, ReachedGoals};
+use step_protocol::ReachedGoals;
 
 /// Arguments of `sctn evaluate`.
 #[derive(Args)]
@@ -90,9 +90,7 @@ impl Evaluate {
         let mut actors: Vec<_> = (0..self.threads.unwrap_or(cores).max(1))
             .map(|_| match self.baseline {
                 Some(Baseline::Difference) => Ok(Actor::Difference),
-                None => Ok(Actor::from(
-                    Policy::load(&checkpoint)?.with_exclusion_radius_m(FAILED_PICK_RADIUS_M),
-                )),
+                None => Ok(Actor::from(Policy::load(&checkpoint)?)),
             })
             .collect::<Result<_>>()?;
         let plan = Episodes {

@@ -1,7 +1,7 @@
 //! Who acts in an evaluation: a policy, or a baseline that has learned nothing.
 
 use gctn::{Evidence, Goal, GoalConditioning, Policy};
-use heightmap::{Heightmap, Workspace};
+use heightmap::{Disk, Heightmap, Workspace};
 use nalgebra::{Isometry2, Point2};
 use pick_place::PickPlace;
 use serde::{Deserialize, Serialize};
@@ -74,12 +74,12 @@ impl Actor {
         }
     }
 
-    /// Where to pick and to place; picks near the excluded ones (world) are left out by a policy.
+    /// Where to pick and to place; a policy picks nothing within an excluded disk (world).
     pub fn act(
         &self,
         observation: &Heightmap,
         goal: Goal<'_>,
-        exclude: &[Isometry2<f64>],
+        exclude: &[Disk],
     ) -> Result<Act, gctn::Error> {
         match self {
             Self::Policy(policy) => {

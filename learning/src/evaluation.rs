@@ -7,7 +7,6 @@ use crate::rollout::{Rollout, demonstrate, roll_out};
 use bags::Demonstration;
 use camera_noise::Perturbation;
 use multiravens::{Environment, EnvironmentError, EpisodeSeed, Problem};
-use nalgebra::Isometry2;
 use serde::{Deserialize, Serialize};
 use std::cell::RefCell;
 use std::sync::Mutex;
@@ -220,11 +219,7 @@ pub fn attempt(
             {
                 last.done_after = actor.done(observation, earned)?;
             }
-            let exclude: Vec<_> = failed_picks
-                .borrow()
-                .exclusions()
-                .map(|disk| Isometry2::new(disk.center_m.coords, 0.0))
-                .collect();
+            let exclude: Vec<_> = failed_picks.borrow().exclusions().collect();
             let act = actor.act(observation, wanted, &exclude)?;
             *said.borrow_mut() = Some(act);
             Ok(Some(act.action))

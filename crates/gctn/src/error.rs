@@ -92,12 +92,10 @@ pub enum Error {
         step: Option<u64>,
     },
     /// Every cell is excluded from picking.
-    #[error("all cells are within {radius_m} m of the {count} excluded picks")]
+    #[error("all cells are within the disks about the {count} excluded picks")]
     NothingToPick {
         /// Number of excluded picks.
         count: usize,
-        /// Radius about each.
-        radius_m: f64,
     },
     /// A file that is no checkpoint of this crate, or a broken one.
     #[error("{}: {problem}", path.display())]

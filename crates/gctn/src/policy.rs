@@ -1,12 +1,12 @@
 //! Decisions.
 
-use heightmap::Heightmap;
+use heightmap::{Disk, Heightmap, Workspace};
 use nalgebra::{Isometry2, Point2};
 use std::path::Path;
 use tch::{Kind, Tensor};
 
 use crate::augment::Warp;
-use crate::input::{check_goal, check_heightmap, encode, rotation_angle, tensor, to_px, to_world};
+use crate::input::{check_goal, check_heightmap, encode, rotation_angle, tensor, to_world};
 use crate::losses::place_logits;
 use crate::network::{Builder, Features, Model};
 use crate::{
@@ -20,7 +20,6 @@ pub struct Policy {
     card: ModelCard,
     calibration: Option<Calibration>,
     device: tch::Device,
-    exclusion_radius_m: f64,
 }
 
 /// Probabilities over a grid that covers the heightmap.
@@ -89,15 +88,6 @@ impl Policy {
             card,
             calibration: None,
             device,
-            exclusion_radius_m: 0.02,
-        }
-    }
-
-    /// The same policy with another radius about excluded picks (2 cm unless said).
-    pub fn with_exclusion_radius_m(self, exclusion_radius_m: f64) -> Self {
-        Self {
-            exclusion_radius_m,
-            ..self
         }
     }
 
@@ -112,19 +102,18 @@ impl Policy {
     }
 
     /// Decides where to pick and where to place, given what is seen and what it should become (the goals that
-    /// the network is [conditioned](crate::GoalConditioning) on: for `sequence` [`Goal::step`]). Cells near an excluded pick (world) are left out. The same input and number of threads give the same bits.
+    /// the network is [conditioned](crate::GoalConditioning) on: for `sequence` [`Goal::step`]). Nothing is picked within an excluded disk (world). The same input and number of threads give the same bits.
     pub fn decide<'a>(
         &self,
         observation: &Heightmap,
         goal: impl Into<Goal<'a>>,
-        exclude: &[Isometry2<f64>],
+        exclude: &[Disk],
     ) -> Result<Decision, Error> {
         let config = &self.model.config;
         let workspace = &observation.workspace;
-        let exclude_px: Vec<_> = exclude.iter().map(|pick| to_px(workspace, pick)).collect();
         tch::no_grad(|| {
             let features = self.features(observation, goal.into())?;
-            let (pick_px, pick_score, pick_map) = self.pick(&features.pick, &exclude_px)?;
+            let (pick_px, pick_score, pick_map) = self.pick(&features.pick, workspace, exclude)?;
             let turns = [(0..config.rotations).collect()];
             let grid = &self.model.grid;
             let logits = place_logits(grid, &features, &[pick_px], &turns, config.rotations);
@@ -193,7 +182,8 @@ impl Policy {
     fn pick(
         &self,
         logits: &Tensor,
-        exclude_px: &[Point2<f64>],
+        workspace: &Workspace,
+        exclude: &[Disk],
     ) -> Result<(Point2<f64>, f64, ScoreMap), Error> {
         let grid = &self.model.grid;
         let mut logits = values(logits, "the pick map")?;
@@ -204,22 +194,20 @@ impl Policy {
                 grid.coordinate_px(row as f64),
             )
         };
-        let radius_px = self.exclusion_radius_m / self.model.config.pixel_size_m;
-        for (index, logit) in logits.iter_mut().enumerate() {
-            let center_px = center_px(index);
-            if exclude_px
-                .iter()
-                .any(|pick| (pick - center_px).norm() <= radius_px)
-            {
-                *logit = f32::NEG_INFINITY;
+        for disk in exclude {
+            let disk_px = workspace.point_px(&disk.center_m);
+            let radius_px = disk.radius_m / self.model.config.pixel_size_m;
+            for (index, logit) in logits.iter_mut().enumerate() {
+                if (disk_px - center_px(index)).norm() <= radius_px {
+                    *logit = f32::NEG_INFINITY;
+                }
             }
         }
         let best = argmax(&logits);
         let top = logits[best];
         if top == f32::NEG_INFINITY {
             return Err(Error::NothingToPick {
-                count: exclude_px.len(),
-                radius_m: self.exclusion_radius_m,
+                count: exclude.len(),
             });
         }
         let sum: f64 = logits

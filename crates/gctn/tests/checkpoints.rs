@@ -4,8 +4,7 @@ use gctn::{
     Calibration, Compact, Decision, Goal, GoalConditioning, Matching, ModelCard, Network,
     NetworkConfig, Policy, Storage, Trainer, TrainingConfig, Verdict,
 };
-use heightmap::{Heightmap, Workspace};
-use nalgebra::Isometry2;
+use heightmap::{Disk, Heightmap, Workspace};
 use safetensors::SafeTensors;
 use safetensors::tensor::{Dtype, TensorView};
 use std::collections::{BTreeMap, HashMap};
@@ -98,16 +97,16 @@ fn sixteen_bits_decide_nearly_the_same_from_half_the_bytes() {
 
 #[test]
 fn excluded_picks_are_not_picked_again() {
-    let policy = trainer().policy().unwrap().with_exclusion_radius_m(0.01);
+    let policy = trainer().policy().unwrap();
     let [observation, goal] = scene();
-    let mut exclude: Vec<Isometry2<f64>> = Vec::new();
+    let mut exclude: Vec<Disk> = Vec::new();
     for _ in 0..5 {
         let decision = policy.decide(&observation, &goal, &exclude).unwrap();
         let pick = decision.pick.translation.vector;
         assert!(
             exclude
                 .iter()
-                .all(|known| (known.translation.vector - pick).norm() > 0.01)
+                .all(|known| (known.center_m.coords - pick).norm() > known.radius_m)
         );
         let sum: f64 = decision
             .pick_map
@@ -116,14 +115,20 @@ fn excluded_picks_are_not_picked_again() {
             .map(|score| f64::from(*score))
             .sum();
         assert!((sum - 1.0).abs() < 1e-4, "{sum}");
-        exclude.push(decision.pick);
+        exclude.push(Disk {
+            center_m: pick.into(),
+            radius_m: 0.01,
+        });
     }
-    let policy = policy.with_exclusion_radius_m(1.0);
+    exclude.iter_mut().for_each(|disk| disk.radius_m = 1.0);
     let error = policy
         .decide(&observation, &goal, &exclude)
         .unwrap_err()
         .to_string();
-    assert_eq!(error, "all cells are within 1 m of the 5 excluded picks");
+    assert_eq!(
+        error,
+        "all cells are within the disks about the 5 excluded picks"
+    );
 }
 
 #[test]

@@ -19,7 +19,6 @@ use msgs::{
     sensor_msgs::Image,
     visualization_msgs::MarkerArray,
 };
-use nalgebra::Isometry2;
 use node_kit::{Active, Level, Node, Publisher, Qos};
 use step_protocol::{Job, PlannerRules, Prediction, Proposal, ProposalPlanner};
 use tokio::sync::mpsc;
@@ -45,13 +44,12 @@ pub async fn configure(node: Node, parameters: GctnPolicyParameters) -> anyhow::
         markers: node.publisher("pick_place/markers", Qos::Latched)?,
         scores: node.publisher("pick_place/scores", Qos::Latched)?,
     };
-    let radius_m = parameters.exclusion_radius_m;
     let threads = parameters.threads;
     let shown = path.display().to_string();
     let policy = node
         .spawn_blocking(move || {
             gctn::set_threads(threads);
-            Policy::load(&path).map(|policy| policy.with_exclusion_radius_m(radius_m))
+            Policy::load(&path)
         })
         .await
         .context("loading the checkpoint")?
@@ -213,12 +211,8 @@ fn start_network(
             // Held by the thread of an earlier activation until its last decision is made.
             let policy = policy.lock().unwrap_or_else(PoisonError::into_inner);
             let start = Instant::now();
-            let exclude = job.exclude.iter();
-            let exclude: Vec<_> = exclude
-                .map(|disk| Isometry2::new(disk.center_m.coords, 0.0))
-                .collect();
             let decision = goal_for(&policy, &job).and_then(|goal| {
-                let decision = policy.decide(&job.observation, goal, &exclude);
+                let decision = policy.decide(&job.observation, goal, &job.exclude);
                 decision.map_err(|error| error.to_string())
             });
             let took = start.elapsed();

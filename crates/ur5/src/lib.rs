@@ -1,9 +1,11 @@
 #![doc = include_str!("../README.md")]
 
 mod arm;
+mod calibration;
 mod trajectory;
 mod work_cell;
 
-pub use arm::{Arm, DhLengths, Joints, Solutions, Unreachable};
+pub use arm::{Arm, DhLengths, Joints, LimitError, Solutions, Unreachable};
+pub use calibration::ArmCalibration;
 pub use trajectory::{JointTrajectory, PlanError, Sampler, TrajectoryPoint};
 pub use work_cell::{Body, Frame, Shape, WorkCell, WorkCellError};

@@ -248,8 +248,8 @@ impl JointTrajectory {
     }
 
     /// The tip on a straight line (rotation by slerp) from rest to rest, with bounded speed and
-    /// acceleration and a continuous jerk; slower where a joint would turn too fast. A turn counts
-    /// as the path of a point 0.1 m off the axis.
+    /// acceleration and a continuous jerk; slower as a whole where a joint would go beyond its speed,
+    /// acceleration or jerk. A turn counts as the path of a point 0.1 m off the axis.
     ///
     /// # Errors
     /// When the way leaves the reach or crosses a singular position, when `from` is beyond the
@@ -320,11 +320,12 @@ impl JointTrajectory {
                 joints,
             });
         }
+        let stretch = stretch.max(stretch_for_acceleration(arm, curve.total_s, &path));
         Self::timed(curve.total_s * stretch, stretch, path)
     }
 
-    /// The straight motion in joint space from rest to rest, as fast as joint speeds and
-    /// accelerations allow; the joints start and stop together.
+    /// The straight motion in joint space from rest to rest, as fast as joint speeds,
+    /// accelerations and jerks allow; the joints start and stop together.
     ///
     /// # Errors
     /// When either end is beyond the limits.
@@ -350,7 +351,11 @@ impl JointTrajectory {
         let mut speed = way
             .zip_map(&arm.max_speed_rad_s, |way, speed| speed / way.abs())
             .min();
-        let acceleration = JOINT_ACCELERATION_RAD_S2 / way.amax();
+        let acceleration = way
+            .zip_map(&arm.max_acceleration_rad_s2, |way, limit| {
+                limit.min(JOINT_ACCELERATION_RAD_S2) / way.abs()
+            })
+            .min();
         if tip_speed_m_s.is_finite() {
             let samples = 64;
             for i in 0..=samples {
@@ -365,7 +370,7 @@ impl JointTrajectory {
             SCurve::new(0.0, 1.0, 1.0)
         };
         let steps = step_count(curve.total_s)?;
-        let path = (0..=steps)
+        let path: Vec<_> = (0..=steps)
             .map(|i| match i {
                 0 => (*from, Joints::zeros()),
                 _ if i == steps => (*to, Joints::zeros()),
@@ -375,7 +380,8 @@ impl JointTrajectory {
                 }
             })
             .collect();
-        Self::timed(curve.total_s, 1.0, path)
+        let stretch = stretch_for_acceleration(arm, curve.total_s, &path);
+        Self::timed(curve.total_s * stretch, stretch, path)
     }
 
     /// Spreads a path evenly over a time, and slows its velocities down by `stretch`.
@@ -472,6 +478,28 @@ impl Cubic {
         }
         (least, most)
     }
+}
+
+/// By how much a path, whose points are evenly spread over a time, has to be stretched in time for its joint accelerations and jerks to keep
+/// the arm's limits; at least 1. Accelerations go with the square of the stretch, jerks with its cube.
+fn stretch_for_acceleration(arm: &Arm, total_s: f64, path: &[(Joints, Joints)]) -> f64 {
+    let step_s = total_s / (path.len() - 1) as f64;
+    let accelerations: Vec<Joints> = path
+        .windows(2)
+        .map(|pair| (pair[1].1 - pair[0].1) / step_s)
+        .collect();
+    let mut stretch = 1.0f64;
+    for (i, acceleration) in accelerations.iter().enumerate() {
+        let share = acceleration
+            .component_div(&arm.max_acceleration_rad_s2)
+            .amax();
+        stretch = stretch.max(share.sqrt());
+        if i > 0 {
+            let jerk = (acceleration - accelerations[i - 1]) / step_s;
+            stretch = stretch.max(jerk.component_div(&arm.max_jerk_rad_s3).amax().cbrt());
+        }
+    }
+    stretch
 }
 
 fn check_start(arm: &Arm, joints: &Joints) -> Result<(), PlanError> {
@@ -636,6 +664,86 @@ mod tests {
             arm.limits_rad = (Joints::repeat(low - margin), Joints::repeat(high - margin));
             prop_assert!(trajectory.check_limits(&arm).is_err());
         }
+    }
+
+    /// Largest joint acceleration and jerk, from velocities at the points.
+    fn peaks(trajectory: &JointTrajectory) -> (f64, f64) {
+        let points = trajectory.points();
+        let step_s = (points[1].time - points[0].time).as_secs_f64();
+        let accelerations: Vec<Joints> = points
+            .windows(2)
+            .map(|pair| (pair[1].velocities_rad_s - pair[0].velocities_rad_s) / step_s)
+            .collect();
+        let jerks = accelerations
+            .windows(2)
+            .map(|pair| ((pair[1] - pair[0]) / step_s).amax());
+        let jerk = jerks.fold(0.0, f64::max);
+        let acceleration = accelerations.iter().map(|a| a.amax()).fold(0.0, f64::max);
+        (acceleration, jerk)
+    }
+
+    proptest! {
+        #![proptest_config(ProptestConfig::with_cases(200))]
+
+        #[test]
+        fn joints_keep_to_their_acceleration_and_jerk(
+            start in tip_pose(), end in tip_pose(), speed in 0.05..1.5f64, limit in 2.0..20.0f64, jerk in 30.0..1000.0f64,
+        ) {
+            let mut arm = arm();
+            let free_arm = arm.clone();
+            arm.set_motion_limits(limit, jerk).unwrap();
+            let from = arm.solve(&start, &arm.ready).unwrap();
+            let line = JointTrajectory::line(&arm, &from, &end, speed, 8.0).unwrap();
+            let way = JointTrajectory::joint_space(&arm, &from, &arm.home).unwrap();
+            for trajectory in [&line, &way] {
+                let (most, most_jerk) = peaks(trajectory);
+                prop_assert!(most <= limit * 1.001, "{most} rad/s2");
+                prop_assert!(most_jerk <= jerk * 1.001, "{most_jerk} rad/s3");
+            }
+            // It is the same path, no faster than without the limits; and where those are kept it is the same motion.
+            let free = JointTrajectory::line(&free_arm, &from, &end, speed, 8.0).unwrap();
+            let later_s = line.duration().as_secs_f64() - free.duration().as_secs_f64();
+            let stays_within = { let (a, j) = peaks(&free); a < 0.99 * limit && j < 0.99 * jerk };
+            prop_assert!(later_s > -1e-9 || limit > Arm::DEFAULT_ACCELERATION_RAD_S2 || jerk > Arm::DEFAULT_JERK_RAD_S3);
+            prop_assert!(!stays_within || later_s < 1e-9, "{later_s} s later");
+            for (a, b) in line.points().iter().zip(free.points()) {
+                prop_assert_eq!(a.positions_rad, b.positions_rad);
+            }
+        }
+    }
+
+    #[test]
+    #[ignore = "prints how fast the joints of the primitive's motions accelerate"]
+    fn peaks_of_fast_transfers() {
+        let mut arm = arm();
+        arm.set_motion_limits(1e6, 1e9).unwrap();
+        let (mut line_most, mut way_most) = ((0.0f64, 0.0f64), (0.0f64, 0.0f64));
+        let steps = |from: f64, to: f64, count: i32| {
+            (0..=count).map(move |i| from + (to - from) * f64::from(i) / f64::from(count))
+        };
+        for (x0, y0) in steps(0.3, 0.7, 4).flat_map(|x| steps(-0.45, 0.45, 6).map(move |y| (x, y)))
+        {
+            for (x1, y1) in
+                steps(0.3, 0.7, 4).flat_map(|x| steps(-0.45, 0.45, 6).map(move |y| (x, y)))
+            {
+                for (turn, height) in [(-1.5, 0.2), (1.5, 0.1), (0.0, 0.2)] {
+                    let Ok(from) = arm.solve(&over(x0, y0, turn, height), &arm.ready) else {
+                        continue;
+                    };
+                    if let Ok(line) =
+                        JointTrajectory::line(&arm, &from, &over(x1, y1, -turn, height), 0.8, 4.0)
+                    {
+                        let (a, j) = peaks(&line);
+                        line_most = (line_most.0.max(a), line_most.1.max(j));
+                    }
+                    let way =
+                        JointTrajectory::joint_space_within(&arm, &arm.home, &from, 1.5).unwrap();
+                    let (a, j) = peaks(&way);
+                    way_most = (way_most.0.max(a), way_most.1.max(j));
+                }
+            }
+        }
+        println!("lines: {line_most:?}; joint space: {way_most:?}");
     }
 
     #[test]

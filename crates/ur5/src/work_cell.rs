@@ -1,6 +1,6 @@
 //! The work cell from urdf/.
 
-use crate::{Arm, DhLengths, Joints};
+use crate::{Arm, ArmCalibration, DhLengths, Joints};
 use nalgebra::{Isometry3, Point3, Translation3, UnitQuaternion, Vector3};
 use std::collections::BTreeMap;
 use std::path::Path;
@@ -143,10 +143,19 @@ pub enum WorkCellError {
 /// Where the arm rests: folded back over its own base, tool down, outside every line of sight
 /// from the cameras to the workspace.
 const HOME_DEG: [f64; 6] = [0.0, -160.0, 120.0, -50.0, -90.0, -90.0];
-/// Over the middle of the workspace, elbow up, tool down.
+/// The UR3e is too short to fold that way: its gripper would touch its own upper arm. It rests behind its base.
+const HOME_UR3E_DEG: [f64; 6] = [-180.0, -80.0, 80.0, -90.0, -90.0, -90.0];
+/// Over the middle of the workspace, elbow up, tool down; of the UR5. Arms of other lengths take the solution nearest to it for the same pose.
 const READY_DEG: [f64; 6] = [-13.0, -80.0, 105.0, -115.0, -90.0, -103.0];
-/// How far, in m and rad, a joint's frame may be off a UR arm's.
-const FRAME_TOLERANCE: f64 = 1e-6;
+/// Where a joint's frame is nearer to that of the drawing (m and rad), the difference is rounding in the URDF.
+const ROUNDING: f64 = 1e-9;
+/// How far (m) and by how much (rad) a factory calibration may move a joint's frame on the one before it.
+const CALIBRATION_M: f64 = 0.02;
+const CALIBRATION_RAD: f64 = 0.05;
+
+/// Where the tip of an arm of other lengths is when it is ready.
+const READY_OVER_M: [f64; 2] = [0.35, 0.0];
+const READY_HEIGHT_M: f64 = 0.1;
 
 const URDF: &str = include_str!("../../../urdf/workcell.urdf");
 
@@ -172,8 +181,42 @@ impl WorkCell {
         Self::parse(&text, &name)
     }
 
+    /// The same cell with the arm's joints where its factory calibration says.
+    ///
+    /// # Errors
+    /// When the calibration is one of another arm.
+    pub fn with_calibration(&self, calibration: &ArmCalibration) -> Result<Self, WorkCellError> {
+        let refuse = |expected| WorkCellError::Missing {
+            path: calibration.path.clone(),
+            expected,
+        };
+        let unreadable = |error: urdf_rs::UrdfError| refuse(error.to_string());
+        let mut robot = urdf_rs::read_from_string(&self.urdf).map_err(unreadable)?;
+        let found = DhLengths::of_origins(&calibration.origins);
+        let difference_m = found.difference_m(&self.arm.lengths);
+        if difference_m > CALIBRATION_M {
+            let name = |lengths: &DhLengths| lengths.model().unwrap_or("arm of unknown lengths");
+            return Err(refuse(format!(
+                "this is the calibration of another robot: that of a {}, expected one of the {} of the URDF (a length differs by {:.1} mm)",
+                name(&found),
+                name(&self.arm.lengths),
+                1000.0 * difference_m,
+            )));
+        }
+        for (joint, origin) in self.joint_names.iter().zip(&calibration.origins) {
+            let Some(joint) = robot.joints.iter_mut().find(|other| other.name == *joint) else {
+                return Err(refuse(format!("the URDF has no joint {joint}")));
+            };
+            let (roll, pitch, yaw) = origin.rotation.euler_angles();
+            joint.origin.xyz.0 = origin.translation.vector.into();
+            joint.origin.rpy.0 = [roll, pitch, yaw];
+        }
+        let urdf = urdf_rs::write_to_string(&robot).map_err(unreadable)?;
+        Self::from_robot(&robot, &urdf).map_err(refuse)
+    }
+
     /// Reads the text of a URDF. It must hold a chain of six revolute joints with a UR arm's
-    /// geometry up to a link `suction_tip`, by way of a link `tool0`; links named
+    /// geometry, calibrated or not, up to a link `suction_tip`, by way of a link `tool0`; links named
     /// `NAME_camera_optical_frame` are cameras; everything else is fixed. Shapes that are no
     /// primitives are left out and their links named in [`Self::skipped`]; a shape without a
     /// colour is grey. `path` names the text in errors.
@@ -436,28 +479,25 @@ fn read_arm<'a>(tree: &Tree<'a>, arm_joints: &[&'a urdf_rs::Joint; 6]) -> Result
     }
     // The first origin counts from the base, not from the world.
     origins[0] = world_from_base.inv_mul(&origins[0]);
-    let at = |joint: usize| origins[joint].translation.vector;
-    let lengths = DhLengths {
-        d1_m: at(0).z,
-        a2_m: at(2).x,
-        a3_m: at(3).x,
-        d4_m: at(3).z,
-        d5_m: -at(4).y,
-        d6_m: at(5).y,
-    };
+    let lengths = DhLengths::of_origins(&origins);
+    let mut nominal = true;
     for ((found, expected), joint) in origins.iter().zip(lengths.joint_origins()).zip(arm_joints) {
         let shift = (found.translation.vector - expected.translation.vector).norm();
         let turn = found.rotation.angle_to(&expected.rotation);
-        if shift > FRAME_TOLERANCE || turn > FRAME_TOLERANCE {
+        if shift > CALIBRATION_M || turn > CALIBRATION_RAD {
             return Err(format!(
-                "joint {} sits at {found}, expected {expected} for the geometry of a UR arm: \
-                 closed-form inverse kinematics needs parallel and crossing axes",
+                "joint {} sits at {found}, expected {expected} for the geometry of a UR arm, give or take the {CALIBRATION_M} m and \
+                 {CALIBRATION_RAD} rad of a calibration",
                 joint.name
             ));
         }
+        nominal &= shift < ROUNDING && turn < ROUNDING;
+    }
+    if nominal {
+        origins = lengths.joint_origins();
     }
     for (name, length) in [("upper arm", lengths.a2_m), ("forearm", lengths.a3_m)] {
-        if length.abs() < FRAME_TOLERANCE {
+        if length.abs() < CALIBRATION_M {
             return Err(format!("the {name} has no length"));
         }
     }
@@ -489,25 +529,39 @@ fn read_arm<'a>(tree: &Tree<'a>, arm_joints: &[&'a urdf_rs::Joint; 6]) -> Result
         return Err("no link tool0 on a joint".into());
     }
     let tool0 = flange("tool0")?;
-    if tool0.translation.vector.norm() > FRAME_TOLERANCE || tool0.rotation.angle() > FRAME_TOLERANCE
-    {
+    if tool0.translation.vector.norm() > 1e-6 || tool0.rotation.angle() > 1e-6 {
         return Err(format!(
             "link tool0 sits at {tool0} on the last joint, expected no offset"
         ));
     }
-    let arm = Arm {
+    let home_deg = match lengths.model() {
+        Some("ur3e") => HOME_UR3E_DEG,
+        _ => HOME_DEG,
+    };
+    let mut arm = Arm {
         world_from_base,
         flange_from_tip: flange("suction_tip")?,
+        origins,
+        nominal,
         lengths,
         limits_rad,
         max_speed_rad_s,
-        home: Joints::from(HOME_DEG).map(f64::to_radians),
+        max_acceleration_rad_s2: Joints::repeat(Arm::DEFAULT_ACCELERATION_RAD_S2),
+        max_jerk_rad_s3: Joints::repeat(Arm::DEFAULT_JERK_RAD_S3),
+        home: Joints::from(home_deg).map(f64::to_radians),
         ready: Joints::from(READY_DEG).map(f64::to_radians),
     };
     if !arm.within_limits(&arm.home) {
         return Err(format!(
-            "joint limits exclude the home position {HOME_DEG:?} degrees"
+            "joint limits exclude the home position {home_deg:?} degrees"
         ));
+    }
+    if lengths != DhLengths::UR5 {
+        let over = nalgebra::Isometry2::new(nalgebra::Vector2::from(READY_OVER_M), 0.0);
+        let tip = Arm::tip_down(&over, READY_HEIGHT_M);
+        arm.ready = arm.solve(&tip, &arm.ready).map_err(|error| {
+            format!("the arm does not reach the middle of the workspace: {error}")
+        })?;
     }
     Ok(arm)
 }

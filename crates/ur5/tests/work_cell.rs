@@ -155,7 +155,12 @@ fn the_top_of_the_table_is_zero_and_holds_the_workspace() {
 
 #[test]
 fn at_home_nothing_stands_between_a_camera_and_the_workspace() {
-    let cell = cell();
+    for (file, _) in ARMS {
+        assert_nothing_is_hidden(file, &cell_of(file));
+    }
+}
+
+fn assert_nothing_is_hidden(file: &str, cell: &WorkCell) {
     let bodies: Vec<_> = cell
         .shapes(&cell.arm.home)
         .filter(|(body, _)| body.link != "table")
@@ -180,7 +185,7 @@ fn at_home_nothing_stands_between_a_camera_and_the_workspace() {
                 let (nearest, distance_m) = nearest(&bodies, &point);
                 assert!(
                     distance_m > margin_m,
-                    "{} hides {} from the {name} camera",
+                    "{file}: {} hides {} from the {name} camera",
                     nearest.link,
                     tip.translation
                 );
@@ -294,7 +299,7 @@ fn what_is_wrong_with_a_urdf_is_named() {
         error
     };
     let cases = [
-        ("xyz=\"-0.425 0 0\"", "xyz=\"-0.425 0.01 0\"", "elbow_joint"),
+        ("xyz=\"-0.425 0 0\"", "xyz=\"-0.425 0.03 0\"", "elbow_joint"),
         ("0 0 0.089159", "0.1 0 0.089159", "shoulder_pan_joint"),
         (
             "xyz=\"-0.425 0 0\"",
@@ -426,4 +431,139 @@ fn the_frames_of_the_links_lead_from_the_world_to_the_tip() {
             "{apart}"
         );
     }
+}
+
+/// The arms of `urdf/`, by the name of their file and of their model.
+const ARMS: [(&str, DhLengths); 4] = [
+    ("workcell.urdf", DhLengths::UR5),
+    ("workcell_ur3e.urdf", DhLengths::UR3E),
+    ("workcell_ur5e.urdf", DhLengths::UR5E),
+    ("workcell_ur10e.urdf", DhLengths::UR10E),
+];
+
+fn cell_of(file: &str) -> WorkCell {
+    WorkCell::load(&Path::new(URDF).with_file_name(file)).unwrap()
+}
+
+#[test]
+fn every_shipped_arm_has_its_published_lengths_and_reaches_its_share_of_the_workspace() {
+    for (file, lengths) in ARMS {
+        let cell = cell_of(file);
+        assert_eq!(cell.arm.lengths, lengths, "{file}");
+        assert!(cell.arm.is_nominal(), "{file}");
+        let poses = grid(&[0.0, 0.06]);
+        let reached = poses
+            .iter()
+            .filter(|tip| cell.arm.solve(tip, &cell.arm.ready).is_ok())
+            .count();
+        // The UR3e is an arm for the near half.
+        let (least, most) = match file {
+            "workcell_ur3e.urdf" => (30, 70),
+            _ => (132, 132),
+        };
+        assert!(
+            (least..=most).contains(&reached),
+            "{file}: {reached} of {}",
+            poses.len()
+        );
+        assert!(
+            cell.arm
+                .tip(&cell.arm.ready)
+                .rotation
+                .angle_to(&poses[0].rotation)
+                < 2.0
+        );
+    }
+}
+
+/// Of the size of one that a factory writes.
+const CALIBRATION: &str = "
+kinematics:
+  shoulder: {x: 0, y: 0, z: 0.16272, roll: -0, pitch: 0, yaw: 5.7e-08}
+  upper_arm: {x: 0.000182, y: 0, z: 0, roll: 1.571315, pitch: 0, yaw: 1.1e-06}
+  forearm: {x: -0.42517, y: 0, z: 0, roll: 3.140148, pitch: 3.141167, yaw: 3.141588}
+  wrist_1: {x: -0.39265, y: -0.0004, z: 0.133106, roll: 0.003028, pitch: -0.001186, yaw: -2.6e-06}
+  wrist_2: {x: -7.1e-06, y: -0.099604, z: -3.2e-07, roll: 1.5708, pitch: 0, yaw: 1.3e-06}
+  wrist_3: {x: 1.4e-05, y: 0.099585, z: 9.5e-05, roll: 1.571752, pitch: 3.141592653589793, yaw: 3.1415925}
+  hash: calib_14698139022496758595
+";
+
+#[test]
+fn a_calibrated_arm_moves_as_its_calibration_says() {
+    let nominal = cell_of("workcell_ur5e.urdf");
+    let calibration = ur5::ArmCalibration::parse(CALIBRATION, "calibration.yaml").unwrap();
+    assert_eq!(
+        calibration.hash.as_deref(),
+        Some("calib_14698139022496758595")
+    );
+    let cell = nominal.with_calibration(&calibration).unwrap();
+    assert!(!cell.arm.is_nominal());
+    let robot = urdf_rs::read_from_string(&cell.urdf).unwrap();
+    let (mut least, mut most) = (f64::INFINITY, 0.0f64);
+    for tip in grid(&[0.0, 0.06]) {
+        let joints = cell.arm.solve(&tip, &cell.arm.ready).unwrap();
+        let angles = |name: &str| {
+            cell.joint_names
+                .iter()
+                .position(|joint| joint == name)
+                .map_or(0.0, |i| joints[i])
+        };
+        // The URDF that is handed on says the same as the arm.
+        let by_urdf = pose_by_urdf(&robot, "suction_tip", &angles);
+        assert!((by_urdf.translation.vector - tip.translation.vector).norm() < 1e-6);
+        let off_m = (nominal.arm.tip(&joints).translation.vector - tip.translation.vector).norm();
+        (least, most) = (least.min(off_m), most.max(off_m));
+    }
+    // What the drawing would have missed by.
+    assert!(
+        least > 1e-4 && (5e-4..0.01).contains(&most),
+        "{least} to {most} m"
+    );
+    let line =
+        JointTrajectory::line(&cell.arm, &cell.arm.ready, &grid(&[0.05])[60], 0.3, 2.0).unwrap();
+    assert!(
+        (cell.arm.tip(&line.last().positions_rad).translation.vector
+            - grid(&[0.05])[60].translation.vector)
+            .norm()
+            < 1e-6
+    );
+}
+
+#[test]
+fn a_calibration_of_another_robot_or_without_sense_is_refused_by_name() {
+    let parse = |text: &str| ur5::ArmCalibration::parse(text, "my_calibration.yaml");
+    let calibration = parse(CALIBRATION).unwrap();
+    for (file, _) in ARMS.iter().filter(|(file, _)| !file.contains("ur5e")) {
+        let error = cell_of(file)
+            .with_calibration(&calibration)
+            .unwrap_err()
+            .to_string();
+        assert!(
+            error.starts_with("my_calibration.yaml: ")
+                && error.contains("another robot")
+                && error.contains("ur5e"),
+            "{error}"
+        );
+    }
+    for (from, to, expected) in [
+        ("wrist_2:", "wrist_4:", "wrist_4"),
+        ("z: 0.16272", "z: .nan", "kinematics.shoulder"),
+        ("z: 0.16272", "z: tall", "kinematics"),
+        ("kinematics:", "dynamics:", "kinematics"),
+    ] {
+        let error = parse(&CALIBRATION.replace(from, to))
+            .unwrap_err()
+            .to_string();
+        assert!(
+            error.starts_with("my_calibration.yaml: ") && error.contains(expected),
+            "{error}"
+        );
+    }
+    // A joint tilted by more than factories do.
+    let tilted = parse(&CALIBRATION.replace("roll: 1.571315", "roll: 1.65")).unwrap();
+    let error = cell_of("workcell_ur5e.urdf")
+        .with_calibration(&tilted)
+        .unwrap_err()
+        .to_string();
+    assert!(error.contains("shoulder_lift_joint"), "{error}");
 }

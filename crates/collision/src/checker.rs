@@ -1,0 +1,506 @@
+//! The check of one motion.
+
+use crate::Terrain;
+use nalgebra::{Isometry3, Point2, Point3, Vector3};
+use parry3d::math::{Pose, Rotation, Vector};
+use parry3d::shape::{Ball, Cuboid, Cylinder};
+use std::time::Duration;
+use ur5::{Arm, Body, JointTrajectory, Joints, Shape, WorkCell};
+
+/// Distances to keep.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Margins {
+    /// From everything fixed and from the heightmap.
+    pub obstacle_m: f64,
+    /// Between links that are not neighbours, and between a link and the carried object.
+    pub self_m: f64,
+}
+
+impl Default for Margins {
+    fn default() -> Self {
+        Self {
+            obstacle_m: 0.01,
+            self_m: 0.004,
+        }
+    }
+}
+
+/// A margin that is no distance.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+#[error("{name} is {value_m}, expected 0 to {MOST_M} m")]
+pub struct MarginsError {
+    name: &'static str,
+    value_m: f64,
+}
+
+/// Larger margins than this are meant for other arms.
+const MOST_M: f64 = 0.2;
+
+/// A rigid object at the tip.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Carried {
+    /// What encloses it.
+    pub shape: Shape,
+    /// Pose of the shape in the frame of the suction tip (z points out of the tool).
+    pub tip_from_shape: Isometry3<f64>,
+}
+
+impl Carried {
+    /// Largest distance of its points from the tip's axis.
+    pub fn radius_m(&self) -> f64 {
+        self.tip_from_shape.translation.vector.xy().norm() + radius_m(&self.shape)
+    }
+}
+
+/// Where contact is wanted: a descent ends here or a rise begins here.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Contact {
+    /// Middle of a circle in the world's xy-plane.
+    pub center_m: Point2<f64>,
+    /// Its radius.
+    pub radius_m: f64,
+    /// The tool may touch what is in the circle up to this height. A carried object may touch anything in it.
+    pub up_to_m: f64,
+}
+
+/// What is there beside the cell, for one motion.
+#[derive(Clone, Debug, Default)]
+pub struct Scene<'a> {
+    /// What stands on the table.
+    pub terrain: Option<&'a Terrain>,
+    /// What the gripper holds.
+    pub carried: Option<Carried>,
+    /// Where contact is wanted.
+    pub contacts: Vec<Contact>,
+}
+
+/// A motion that keeps its margins.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Clearance {
+    /// The least distance found, margins not subtracted; distances beyond 50 mm over the margin are not looked at closely.
+    pub least_m: f64,
+    /// Joint positions at which distances were computed.
+    pub samples: usize,
+}
+
+/// A motion that must not be carried out.
+#[derive(Clone, Debug, PartialEq, thiserror::Error)]
+#[error(
+    "{} s after its start the motion brings {body} to {distance_m:.3} m from {obstacle}, expected {margin_m} m or more (joints {joints})",
+    time.as_secs_f64()
+)]
+pub struct Collision {
+    /// Time from the start of the motion.
+    pub time: Duration,
+    /// The link, or "the carried object".
+    pub body: String,
+    /// The link or "the heightmap at (x, y)".
+    pub obstacle: String,
+    /// Distance of the two, 0 where they overlap.
+    pub distance_m: f64,
+    /// Distance to keep.
+    pub margin_m: f64,
+    /// Joint positions there, in rad, as text.
+    pub joints: String,
+}
+
+/// Between samples nothing moves further than this, or than the distance left.
+const RESOLUTION_M: f64 = 0.002;
+/// Motions are looked at in steps of this time to know how far they go.
+const TICK: Duration = Duration::from_micros(500);
+/// Distances of more than this over the margin need not be known exactly.
+const FAR_M: f64 = 0.05;
+/// Columns of the heightmap reach down to here.
+const BOTTOM_M: f64 = -0.05;
+/// The link that carries the gripper.
+const TOOL: usize = 5;
+
+/// A shape on its carrier, ready for queries.
+#[derive(Clone, Debug)]
+struct Part {
+    link: String,
+    /// None: fixed in the world.
+    carrier: Option<usize>,
+    pose: Isometry3<f64>,
+    shape: Shape,
+    radius_m: f64,
+}
+
+/// Checks motions of the arm of a cell.
+#[derive(Clone, Debug)]
+pub struct CollisionChecker {
+    arm: Arm,
+    margins: Margins,
+    moving: Vec<Part>,
+    fixed: Vec<Part>,
+    /// The link that the arm turns on: it counts as one of the arm's.
+    base: String,
+    /// For each joint, how far from its axis a point of arm or tool can be.
+    reach_m: [f64; 6],
+}
+
+impl CollisionChecker {
+    /// For the arm and the collision shapes of a cell.
+    ///
+    /// # Errors
+    /// When a margin is negative, not finite or larger than 0.2 m.
+    pub fn new(cell: &WorkCell, margins: Margins) -> Result<Self, MarginsError> {
+        for (name, value_m) in [
+            ("the margin to obstacles", margins.obstacle_m),
+            ("the margin between links", margins.self_m),
+        ] {
+            if !(0.0..=MOST_M).contains(&value_m) {
+                return Err(MarginsError { name, value_m });
+            }
+        }
+        let part = |body: &Body| Part {
+            link: body.link.clone(),
+            carrier: body.moving_link,
+            pose: body.pose,
+            shape: body.shape,
+            radius_m: radius_m(&body.shape),
+        };
+        let (moving, fixed): (Vec<Part>, Vec<Part>) = cell
+            .collisions
+            .iter()
+            .map(part)
+            .partition(|part| part.carrier.is_some());
+        let base = cell.frames.iter().find(|frame| frame.joint == Some(0));
+        // From joint to joint, and from there to the end of the parts of each link.
+        let arm = cell.arm.clone();
+        let mut reach_m = [0.0; 6];
+        let mut beyond_m = 0.0f64;
+        for joint in (0..6).rev() {
+            let parts = moving.iter().filter(|part| part.carrier == Some(joint));
+            let ends = parts.map(|part| part.pose.translation.vector.norm() + part.radius_m);
+            let own_m = ends.fold(beyond_m, f64::max);
+            reach_m[joint] = own_m;
+            beyond_m = own_m + arm.joint_origins()[joint].translation.vector.norm();
+        }
+        Ok(Self {
+            arm,
+            margins,
+            moving,
+            fixed,
+            base: base.map_or_else(String::new, |frame| frame.parent.clone()),
+            reach_m,
+        })
+    }
+
+    /// Whether the arm may follow a trajectory through a scene.
+    ///
+    /// # Errors
+    /// The first collision on the way, margins included.
+    pub fn check(
+        &self,
+        trajectory: &JointTrajectory,
+        scene: &Scene<'_>,
+    ) -> Result<Clearance, Box<Collision>> {
+        let mut reach_m = self.reach_m;
+        if let Some(carried) = &scene.carried {
+            let tip_m = self.arm.flange_from_tip.translation.vector.norm();
+            let end_m =
+                tip_m + carried.tip_from_shape.translation.vector.norm() + radius_m(&carried.shape);
+            let mut beyond_m = end_m;
+            for joint in (0..6).rev() {
+                reach_m[joint] = f64::max(reach_m[joint], beyond_m);
+                beyond_m += self.arm.joint_origins()[joint].translation.vector.norm();
+            }
+        }
+        let moved_m = |from: &Joints, to: &Joints| {
+            (to - from)
+                .iter()
+                .zip(reach_m)
+                .map(|(turn, reach_m)| turn.abs() * reach_m)
+                .sum::<f64>()
+        };
+        let end = trajectory.duration();
+        let mut sampler = trajectory.sampler();
+        let mut clearance = Clearance {
+            least_m: f64::INFINITY,
+            samples: 0,
+        };
+        let mut last = sampler.state(Duration::ZERO).positions_rad;
+        let mut left_m = self.sample(&last, Duration::ZERO, scene, &mut clearance)?;
+        let mut previous = (Duration::ZERO, last);
+        let mut time = Duration::ZERO;
+        while time < end {
+            time = (time + TICK).min(end);
+            let joints = sampler.state(time).positions_rad;
+            if moved_m(&last, &joints) > left_m.max(RESOLUTION_M) {
+                // The tick before is as far as the distance reached, or this one where it was the last sample.
+                let (at, sampled) = if previous.1 == last {
+                    (time, joints)
+                } else {
+                    previous
+                };
+                left_m = self.sample(&sampled, at, scene, &mut clearance)?;
+                last = sampled;
+                if moved_m(&last, &joints) > left_m.max(RESOLUTION_M) {
+                    left_m = self.sample(&joints, time, scene, &mut clearance)?;
+                    last = joints;
+                }
+            }
+            previous = (time, joints);
+        }
+        if previous.1 != last {
+            self.sample(&previous.1, previous.0, scene, &mut clearance)?;
+        }
+        Ok(clearance)
+    }
+
+    /// Checks one joint position; how far everything is from its margin.
+    fn sample(
+        &self,
+        joints: &Joints,
+        time: Duration,
+        scene: &Scene<'_>,
+        clearance: &mut Clearance,
+    ) -> Result<f64, Box<Collision>> {
+        clearance.samples += 1;
+        let links = self.arm.links(joints);
+        let tip = links[TOOL] * self.arm.flange_from_tip;
+        let collision = |body: &str, obstacle: String, distance_m: f64, margin_m: f64| {
+            let joints: Vec<String> = joints.iter().map(|q| format!("{q:.4}")).collect();
+            Box::new(Collision {
+                time,
+                body: body.into(),
+                obstacle,
+                distance_m,
+                margin_m,
+                joints: joints.join(", "),
+            })
+        };
+        let mut left_m = f64::INFINITY;
+        let mut count = |distance_m: f64, margin_m: f64| {
+            clearance.least_m = clearance.least_m.min(distance_m);
+            left_m = left_m.min(distance_m - margin_m);
+            distance_m >= margin_m
+        };
+        let posed: Vec<(&Part, Isometry3<f64>)> = self
+            .moving
+            .iter()
+            .map(|part| {
+                let carrier = part.carrier.unwrap_or(0);
+                (part, links[carrier] * part.pose)
+            })
+            .collect();
+        let held = scene.carried.map(|carried| {
+            let part = Part {
+                link: "the carried object".into(),
+                carrier: None,
+                pose: Isometry3::identity(),
+                radius_m: radius_m(&carried.shape),
+                shape: carried.shape,
+            };
+            (part, tip * carried.tip_from_shape)
+        });
+        let held = held.as_ref().map(|(part, pose)| (part, *pose));
+        for (part, pose) in posed.iter().copied().chain(held) {
+            let touches = part.carrier.is_none();
+            for other in &self.fixed {
+                let is_base = other.link == self.base;
+                // The base and the first link touch by design.
+                if part.carrier == Some(0) && is_base {
+                    continue;
+                }
+                let margin_m = match is_base && !touches {
+                    true => self.margins.self_m,
+                    false => self.margins.obstacle_m,
+                };
+                if touches || part.carrier == Some(TOOL) {
+                    let top_m = other.pose.translation.z
+                        + other
+                            .shape
+                            .extent_m(&other.pose.inverse_transform_vector(&Vector3::z()));
+                    let here = Point2::from(pose.translation.vector.xy());
+                    if scene.contacts.iter().any(|contact| {
+                        (here - contact.center_m).norm() <= contact.radius_m
+                            && (touches || top_m <= contact.up_to_m)
+                    }) {
+                        continue;
+                    }
+                }
+                let distance_m = distance_m((part, &pose), (other, &other.pose), margin_m);
+                if !count(distance_m, margin_m) {
+                    return Err(collision(
+                        &part.link,
+                        other.link.clone(),
+                        distance_m,
+                        margin_m,
+                    ));
+                }
+            }
+            let margin_m = self.margins.obstacle_m;
+            if let Some(terrain) = scene.terrain {
+                let (distance_m, at) =
+                    terrain_distance_m(part, &pose, terrain, margin_m, |at, height_m| {
+                        (touches || part.carrier == Some(TOOL))
+                            && scene.contacts.iter().any(|contact| {
+                                (at - contact.center_m).norm() <= contact.radius_m
+                                    && (touches || height_m <= contact.up_to_m)
+                            })
+                    });
+                if !count(distance_m, margin_m) {
+                    let obstacle = format!("the heightmap at ({:.3}, {:.3})", at.x, at.y);
+                    return Err(collision(&part.link, obstacle, distance_m, margin_m));
+                }
+            }
+        }
+        let margin_m = self.margins.self_m;
+        for (i, (part, pose)) in posed.iter().enumerate() {
+            // Neighbours touch by design; so do the gripper and what it holds, and the last wrist is beside that.
+            let others = posed[..i]
+                .iter()
+                .copied()
+                .filter(|(other, _)| {
+                    part.carrier
+                        .unwrap_or(0)
+                        .abs_diff(other.carrier.unwrap_or(0))
+                        >= 2
+                })
+                .chain(held.filter(|_| part.carrier.unwrap_or(0) < TOOL - 1));
+            for (other, other_pose) in others {
+                let distance_m = distance_m((part, pose), (other, &other_pose), margin_m);
+                if !count(distance_m, margin_m) {
+                    return Err(collision(
+                        &other.link,
+                        part.link.clone(),
+                        distance_m,
+                        margin_m,
+                    ));
+                }
+            }
+        }
+        Ok(left_m)
+    }
+}
+
+/// Radius of a ball about the middle of a shape that holds all of it.
+fn radius_m(shape: &Shape) -> f64 {
+    match shape {
+        Shape::Cuboid { size_m } => 0.5 * size_m.norm(),
+        Shape::Cylinder { radius_m, length_m } => radius_m.hypot(0.5 * length_m),
+        Shape::Sphere { radius_m } => *radius_m,
+    }
+}
+
+/// Distance of two parts: exact near the margin, a lower bound further away.
+fn distance_m(a: (&Part, &Isometry3<f64>), b: (&Part, &Isometry3<f64>), margin_m: f64) -> f64 {
+    let bound = |(from, from_pose): (&Part, &Isometry3<f64>),
+                 (to, to_pose): (&Part, &Isometry3<f64>)| {
+        let center = Point3::from(from_pose.translation.vector);
+        to.shape
+            .distance_m(&to_pose.inverse_transform_point(&center))
+            - from.radius_m
+    };
+    let least_m = bound(a, b).max(bound(b, a));
+    if least_m > margin_m + FAR_M {
+        return least_m;
+    }
+    exact_distance_m(a, b)
+}
+
+fn exact_distance_m(
+    (a, a_pose): (&Part, &Isometry3<f64>),
+    (b, b_pose): (&Part, &Isometry3<f64>),
+) -> f64 {
+    let (a_pose, a_shape) = prepared(a_pose, &a.shape);
+    let (b_pose, b_shape) = prepared(b_pose, &b.shape);
+    parry3d::query::distance(&a_pose, a_shape.as_shape(), &b_pose, b_shape.as_shape())
+        .map_or(0.0, |found| f64::from(found.distance))
+}
+
+/// A shape of parry, on the stack.
+enum Prepared {
+    Cuboid(Cuboid),
+    Cylinder(Cylinder),
+    Ball(Ball),
+}
+
+impl Prepared {
+    fn as_shape(&self) -> &dyn parry3d::shape::Shape {
+        match self {
+            Self::Cuboid(shape) => shape,
+            Self::Cylinder(shape) => shape,
+            Self::Ball(shape) => shape,
+        }
+    }
+}
+
+fn prepared(pose: &Isometry3<f64>, shape: &Shape) -> (Pose, Prepared) {
+    let vector = |v: Vector3<f64>| Vector::new(v.x as f32, v.y as f32, v.z as f32);
+    let prepared = match *shape {
+        Shape::Cuboid { size_m } => Prepared::Cuboid(Cuboid::new(vector(0.5 * size_m))),
+        Shape::Cylinder { radius_m, length_m } => {
+            Prepared::Cylinder(Cylinder::new((0.5 * length_m) as f32, radius_m as f32))
+        }
+        Shape::Sphere { radius_m } => Prepared::Ball(Ball::new(radius_m as f32)),
+    };
+    // Cylinders of parry lie along y, ours along z.
+    let mut rotation = pose.rotation;
+    if matches!(shape, Shape::Cylinder { .. }) {
+        rotation *= nalgebra::UnitQuaternion::from_axis_angle(
+            &Vector3::x_axis(),
+            std::f64::consts::FRAC_PI_2,
+        );
+    }
+    let q = rotation.coords.cast::<f32>();
+    let rotation = Rotation::from_xyzw(q.x, q.y, q.z, q.w).normalize();
+    (
+        Pose::from_parts(vector(pose.translation.vector), rotation),
+        prepared,
+    )
+}
+
+/// Distance of a part from the columns of the terrain that are not left out, up to [`FAR_M`] over the margin, and where.
+fn terrain_distance_m(
+    part: &Part,
+    pose: &Isometry3<f64>,
+    terrain: &Terrain,
+    margin_m: f64,
+    is_left_out: impl Fn(Point2<f64>, f64) -> bool,
+) -> (f64, Point2<f64>) {
+    let center = pose.translation.vector;
+    let look_m = margin_m + 0.4 * FAR_M;
+    let extent = Vector3::from_fn(|axis, _| {
+        let along = pose.inverse_transform_vector(&Vector3::ith(axis, 1.0));
+        part.shape.extent_m(&along)
+    });
+    let lowest_m = center.z - extent.z;
+    let over_all_m = lowest_m - terrain.highest_m();
+    let nowhere = Point2::from(center.xy());
+    if over_all_m > look_m {
+        return (over_all_m, nowhere);
+    }
+    let around = extent.xy().add_scalar(look_m);
+    let half_m = 0.5 * terrain.size_m;
+    let mut nearest = (look_m, nowhere);
+    for (at, height_m) in terrain.columns(nowhere - around, nowhere + around) {
+        let beside = (at.coords - center.xy()).abs() - extent.xy();
+        let beside = beside.add_scalar(-half_m).sup(&nalgebra::Vector2::zeros());
+        let above_m = (lowest_m - height_m).max(0.0);
+        if beside.norm().hypot(above_m) >= nearest.0 || is_left_out(at, height_m) {
+            continue;
+        }
+        let length_m = (height_m - BOTTOM_M).max(1e-3);
+        let column = Part {
+            link: String::new(),
+            carrier: None,
+            pose: Isometry3::identity(),
+            shape: Shape::Cuboid {
+                size_m: Vector3::new(terrain.size_m, terrain.size_m, length_m),
+            },
+            radius_m: 0.0,
+        };
+        let column_pose = Isometry3::translation(at.x, at.y, height_m - 0.5 * length_m);
+        let distance_m = exact_distance_m((part, pose), (&column, &column_pose));
+        if distance_m < nearest.0 {
+            nearest = (distance_m, at);
+            if distance_m == 0.0 {
+                break;
+            }
+        }
+    }
+    nearest
+}

@@ -1,0 +1,11 @@
+#![doc = include_str!("../README.md")]
+
+mod checker;
+mod lift_out;
+mod terrain;
+
+pub use checker::{
+    Carried, Clearance, Collision, CollisionChecker, Contact, Margins, MarginsError, Scene,
+};
+pub use lift_out::lift_out;
+pub use terrain::Terrain;

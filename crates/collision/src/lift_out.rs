@@ -1,0 +1,139 @@
+//! The object that was picked, as the heightmap before the pick shows it.
+
+use crate::Carried;
+use heightmap::Heightmap;
+use nalgebra::{Isometry3, Point2, Point3, Translation3, Vector3};
+use ur5::Shape;
+
+/// A cell belongs to the object if its height differs by less from a neighbour's that does.
+const STEP_M: f32 = 0.006;
+/// Cells further from the pick belong to something else, the table for instance.
+const REACH_M: f64 = 0.15;
+
+/// The object under a pick and the heightmap without it. `tip` is the pose of the suction tip at the contact: the box is fixed to it. Where it
+/// stood the heightmap is as high as the highest of the lower cells around it.
+///
+/// None when the pick lies outside the heightmap.
+pub fn lift_out(heightmap: &Heightmap, tip: &Isometry3<f64>) -> Option<(Carried, Heightmap)> {
+    let workspace = &heightmap.workspace;
+    let pick = Point2::from(tip.translation.vector.xy());
+    let start = workspace.pixel(&pick)?;
+    let (rows, cols) = (workspace.rows, workspace.cols);
+    let start = start.row * cols + start.col;
+    let center = |index: usize| {
+        workspace.center(heightmap::Pixel {
+            row: index / cols,
+            col: index % cols,
+        })
+    };
+    let mut member = vec![false; workspace.len()];
+    member[start] = true;
+    let (mut object, mut border, mut next) = (vec![start], Vec::new(), 0);
+    while next < object.len() {
+        let index = object[next];
+        next += 1;
+        let (row, col) = (index / cols, index % cols);
+        let sides = [
+            (row > 0).then(|| index - cols),
+            (row + 1 < rows).then(|| index + cols),
+            (col > 0).then(|| index - 1),
+            (col + 1 < cols).then(|| index + 1),
+        ];
+        for side in sides
+            .into_iter()
+            .flatten()
+            .filter(|side| heightmap.is_seen(*side))
+        {
+            if member[side] {
+                continue;
+            }
+            let step_m = (heightmap.height_m[side] - heightmap.height_m[index]).abs();
+            if step_m < STEP_M && (center(side) - pick).norm() < REACH_M {
+                member[side] = true;
+                object.push(side);
+            } else {
+                border.push(side);
+            }
+        }
+    }
+    let height = |index: &usize| heightmap.height_m[*index];
+    let lowest_m = object.iter().map(height).fold(f32::INFINITY, f32::min);
+    let lower = border
+        .iter()
+        .map(height)
+        .filter(|height_m| *height_m < lowest_m);
+    let floor_m = lower.fold(0.0, f32::max);
+    let around_m = border.iter().map(height).fold(lowest_m, f32::min);
+    let mut rest = heightmap.clone();
+    let (mut low, mut high) = (
+        Vector3::repeat(f64::INFINITY),
+        Vector3::repeat(f64::NEG_INFINITY),
+    );
+    let half_m = 0.5 * workspace.pixel_size_m;
+    for index in object {
+        let at = center(index);
+        let top_m = f64::from(heightmap.height_m[index]);
+        for corner in [
+            (-half_m, -half_m),
+            (-half_m, half_m),
+            (half_m, -half_m),
+            (half_m, half_m),
+        ] {
+            // As deep as it may be: down to the lowest cell around it.
+            for z_m in [f64::from(around_m.min(lowest_m)), top_m] {
+                let point = Point3::new(at.x + corner.0, at.y + corner.1, z_m);
+                let in_tip = tip.inverse_transform_point(&point).coords;
+                (low, high) = (low.inf(&in_tip), high.sup(&in_tip));
+            }
+        }
+        rest.height_m[index] = floor_m;
+    }
+    // Something flat has some thickness.
+    let size_m = (high - low).sup(&Vector3::repeat(1e-3));
+    let carried = Carried {
+        shape: Shape::Cuboid { size_m },
+        tip_from_shape: Isometry3::from_parts(
+            Translation3::from(0.5 * (low + high)),
+            nalgebra::UnitQuaternion::identity(),
+        ),
+    };
+    Some((carried, rest))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use heightmap::Workspace;
+    use nalgebra::Isometry2;
+    use ur5::Arm;
+
+    #[test]
+    fn a_block_is_lifted_out_of_the_heightmap_with_its_size() {
+        let mut heightmap = Heightmap::new(Workspace::RAVENS);
+        heightmap.rgb.fill(100);
+        // 40 x 20 mm and 30 mm high on a stand of 10 mm.
+        for row in 90..130 {
+            heightmap.height_m[row * 160 + 40..row * 160 + 100].fill(0.01);
+        }
+        let before = heightmap.clone();
+        for row in 100..112 {
+            heightmap.height_m[row * 160 + 60..row * 160 + 66].fill(0.04);
+        }
+        let at = heightmap.workspace.point_m(&Point2::new(63.0, 106.0));
+        let tip = Arm::tip_down(&Isometry2::new(at.coords, 0.3), 0.04);
+        let (carried, rest) = lift_out(&heightmap, &tip).unwrap();
+        assert_eq!(rest, before);
+        let Shape::Cuboid { size_m } = carried.shape else {
+            panic!("{carried:?}");
+        };
+        // In the frame of the tip, which is turned by 0.3 rad.
+        let (s, c) = 0.3f64.sin_cos();
+        let (x_m, y_m) = (6.0 * 0.003125, 12.0 * 0.003125);
+        let expected = Vector3::new(x_m * c + y_m * s, x_m * s + y_m * c, 0.03);
+        assert!((size_m - expected).amax() < 1e-6, "{size_m} {expected}");
+        // Below the tip, whose z points down.
+        assert!((carried.tip_from_shape.translation.z - 0.015).abs() < 1e-6);
+        let outside = Arm::tip_down(&Isometry2::translation(2.0, 0.0), 0.0);
+        assert!(lift_out(&heightmap, &outside).is_none());
+    }
+}

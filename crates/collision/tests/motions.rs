@@ -1,0 +1,379 @@
+//! What the check finds, and what it lets pass.
+
+use collision::{Carried, Clearance, CollisionChecker, Contact, Margins, Scene, Terrain};
+use heightmap::{Heightmap, Workspace};
+use nalgebra::{Isometry2, Isometry3, Point2, Point3, Vector2, Vector3};
+use pick_place::{PickPlace, PrimitiveSettings, Robot};
+use proptest::prelude::*;
+use std::convert::Infallible;
+use ur5::{Arm, JointTrajectory, Joints, Shape, WorkCell};
+
+fn cell() -> WorkCell {
+    WorkCell::builtin().unwrap()
+}
+
+fn checker(cell: &WorkCell) -> CollisionChecker {
+    CollisionChecker::new(cell, Margins::default()).unwrap()
+}
+
+fn empty_table() -> Heightmap {
+    let mut heightmap = Heightmap::new(Workspace::RAVENS);
+    heightmap.rgb.fill(100);
+    heightmap
+}
+
+/// Remembers the motions; its tool finds the table.
+struct Recorder {
+    joints: Joints,
+    holds: bool,
+    motions: Vec<(JointTrajectory, bool)>,
+}
+
+impl Robot for Recorder {
+    type Error = Infallible;
+    fn joints(&mut self) -> Result<Joints, Infallible> {
+        Ok(self.joints)
+    }
+    fn follow(&mut self, trajectory: &JointTrajectory) -> Result<bool, Infallible> {
+        self.motions.push((trajectory.clone(), self.holds));
+        self.joints = trajectory.last().positions_rad;
+        Ok(true)
+    }
+    fn follow_until_contact(&mut self, trajectory: &JointTrajectory) -> Result<bool, Infallible> {
+        self.follow(trajectory)
+    }
+    fn set_suction(&mut self, on: bool) -> Result<(), Infallible> {
+        self.holds = on;
+        Ok(())
+    }
+    fn holds(&mut self) -> Result<bool, Infallible> {
+        Ok(self.holds)
+    }
+}
+
+fn motions(
+    arm: &Arm,
+    action: &PickPlace,
+    settings: &PrimitiveSettings,
+) -> Option<Vec<(JointTrajectory, bool)>> {
+    let mut robot = Recorder {
+        joints: arm.home,
+        holds: false,
+        motions: Vec::new(),
+    };
+    pick_place::execute(&mut robot, arm, action, settings, |_| ()).ok()?;
+    Some(robot.motions)
+}
+
+/// Contact at both ends of a motion that are low.
+fn contacts(arm: &Arm, motion: &JointTrajectory, radius_m: f64) -> Vec<Contact> {
+    [motion.points()[0], *motion.last()]
+        .iter()
+        .map(|point| arm.tip(&point.positions_rad).translation.vector)
+        .filter(|tip| tip.z < 0.06)
+        .map(|tip| Contact {
+            center_m: Point2::from(tip.xy()),
+            radius_m,
+            up_to_m: 0.02,
+        })
+        .collect()
+}
+
+fn pose() -> impl Strategy<Value = Isometry2<f64>> {
+    (0.3..0.7f64, -0.42..0.42f64, -3.1..3.1f64)
+        .prop_map(|(x, y, yaw)| Isometry2::new(Vector2::new(x, y), yaw))
+}
+
+proptest! {
+    #![proptest_config(ProptestConfig::with_cases(60))]
+
+    #[test]
+    fn whole_primitives_over_an_empty_table_pass(pick in pose(), place in pose(), beads in any::<bool>()) {
+        let cell = cell();
+        let settings = if beads { PrimitiveSettings::BEADS } else { PrimitiveSettings::RIGID };
+        let Some(motions) = motions(&cell.arm, &PickPlace { pick, place }, &settings) else {
+            return Ok(());
+        };
+        let checker = checker(&cell);
+        let terrain = Terrain::new(&empty_table());
+        for (motion, holds) in &motions {
+            // A plate below the tip, thin enough for the transfer of beads; the tool finds the table, not the plate.
+            let carried = holds.then_some(Carried {
+                shape: Shape::Cuboid { size_m: Vector3::new(0.04, 0.04, 0.02) },
+                tip_from_shape: Isometry3::translation(0.0, 0.0, 0.01),
+            });
+            let contacts = contacts(&cell.arm, motion, 0.06);
+            let scene = Scene { terrain: Some(&terrain), carried, contacts };
+            let passed = checker.check(motion, &scene);
+            prop_assert!(passed.is_ok(), "{}", passed.unwrap_err());
+        }
+    }
+
+    /// What passes the check keeps its distance in a slow, independent computation too.
+    #[test]
+    fn what_passes_keeps_its_margin_everywhere(
+        from in prop::array::uniform6(-3.0..3.0f64), to in prop::array::uniform6(-3.0..3.0f64),
+    ) {
+        let cell = cell();
+        let checker = checker(&cell);
+        let (from, to) = (Joints::from(from), Joints::from(to));
+        let way = JointTrajectory::joint_space(&cell.arm, &from, &to).unwrap();
+        let passed = checker.check(&way, &Scene::default());
+        let steps = 400;
+        let mut least: (f64, String) = (f64::INFINITY, String::new());
+        for step in 0..=steps {
+            let joints = way.sample(way.duration() * step / steps);
+            let bodies: Vec<_> = cell.posed(&cell.collisions, &joints).collect();
+            for (body, pose) in bodies.iter().filter(|(body, _)| body.moving_link.is_some()) {
+                for (other, other_pose) in bodies.iter().filter(|(body, _)| body.moving_link.is_none()) {
+                    if other.link == "base_link_inertia" {
+                        continue;
+                    }
+                    for point in surface(&body.shape) {
+                        let distance_m = other.shape.distance_m(&other_pose.inverse_transform_point(&(pose * point)));
+                        if distance_m < least.0 {
+                            least = (distance_m, format!("{} and {}", body.link, other.link));
+                        }
+                    }
+                }
+            }
+        }
+        match passed {
+            Ok(Clearance { least_m, .. }) => {
+                prop_assert!(least.0 > 0.01 - 0.002, "{least:?}");
+                // Points on a surface are no nearer than the surface.
+                prop_assert!(least_m < 0.06 + 0.25 || least.0 > 0.01, "{least_m} {least:?}");
+            }
+            // Whatever it refuses is near, or would be near with itself.
+            Err(collision) => prop_assert!(
+                least.0 < 0.01 + 0.03 || cell.collisions.iter().any(|body| body.link == collision.obstacle && body.moving_link.is_some()),
+                "{collision}; {least:?}"
+            ),
+        }
+    }
+
+    #[test]
+    fn a_column_on_the_way_of_the_tip_is_always_found(start in pose(), end in pose(), share in 0.1..0.9f64, height_m in 0.1..0.3f64) {
+        let cell = cell();
+        let checker = checker(&cell);
+        let arm = &cell.arm;
+        let over = |pose: &Isometry2<f64>| Arm::tip_down(&Isometry2::new(pose.translation.vector, 0.0), height_m - 0.03);
+        let (Ok(from), true) = (arm.solve(&over(&start), &arm.ready), (start.translation.vector - end.translation.vector).norm() > 0.05) else {
+            return Ok(());
+        };
+        let Ok(line) = JointTrajectory::line(arm, &from, &over(&end), 0.8, 4.0) else {
+            return Ok(());
+        };
+        let at = start.translation.vector + (end.translation.vector - start.translation.vector) * share;
+        let mut heightmap = empty_table();
+        let pixel = heightmap.workspace.pixel(&Point2::from(at)).unwrap();
+        let clear = checker.check(&line, &Scene { terrain: Some(&Terrain::new(&heightmap)), ..Scene::default() });
+        heightmap.height_m[pixel.row * 160 + pixel.col] = height_m as f32;
+        let terrain = Terrain::new(&heightmap);
+        let found = checker.check(&line, &Scene { terrain: Some(&terrain), ..Scene::default() });
+        prop_assert!(found.is_err(), "{found:?}");
+        if clear.is_ok() {
+            prop_assert!(found.unwrap_err().obstacle.starts_with("the heightmap at"));
+        }
+    }
+
+    #[test]
+    fn what_passes_with_a_wide_margin_passes_with_a_narrow_one(pick in pose(), to in prop::array::uniform6(-2.0..2.0f64), wide in 0.01..0.05f64) {
+        let cell = cell();
+        let arm = &cell.arm;
+        let from = arm.solve(&Arm::tip_down(&pick, 0.15), &arm.ready);
+        let Ok(from) = from else { return Ok(()) };
+        let way = JointTrajectory::joint_space(arm, &from, &Joints::from(to)).unwrap();
+        let check = |obstacle_m, self_m| {
+            let margins = Margins { obstacle_m, self_m };
+            CollisionChecker::new(&cell, margins).unwrap().check(&way, &Scene::default()).is_ok()
+        };
+        prop_assert!(!check(wide, 0.004) || check(0.005, 0.0));
+    }
+}
+
+/// Points on a shape.
+fn surface(shape: &Shape) -> Vec<Point3<f64>> {
+    let Shape::Cylinder { radius_m, length_m } = *shape else {
+        panic!("the arm is made of cylinders");
+    };
+    (0..12)
+        .flat_map(|i| {
+            let (sin, cos) = (f64::from(i) * std::f64::consts::TAU / 12.0).sin_cos();
+            (0..=8).map(move |j| {
+                Point3::new(
+                    radius_m * cos,
+                    radius_m * sin,
+                    length_m * (f64::from(j) / 8.0 - 0.5),
+                )
+            })
+        })
+        .collect()
+}
+
+#[test]
+fn a_post_of_the_urdf_and_a_camera_are_obstacles() {
+    let cell = cell();
+    let post = "<link name=\"post\"><collision><geometry><cylinder radius=\"0.02\" length=\"0.8\"/></geometry></collision></link>\
+        <joint name=\"world-post\" type=\"fixed\"><parent link=\"world\"/><child link=\"post\"/><origin xyz=\"0.45 0.1 0.4\" rpy=\"0 0 0\"/></joint></robot>";
+    let with = WorkCell::parse(&cell.urdf.replace("</robot>", post), "cell.urdf").unwrap();
+    let arm = &cell.arm;
+    let over = |y_m: f64| Arm::tip_down(&Isometry2::translation(0.45, y_m), 0.2);
+    let from = arm.solve(&over(-0.3), &arm.ready).unwrap();
+    let line = JointTrajectory::line(arm, &from, &over(0.4), 0.5, 2.0).unwrap();
+    checker(&cell).check(&line, &Scene::default()).unwrap();
+    let collision = checker(&with).check(&line, &Scene::default()).unwrap_err();
+    assert_eq!(collision.obstacle, "post");
+    assert!(
+        collision.distance_m < 0.01 && collision.to_string().contains("post"),
+        "{collision}"
+    );
+    // Up to the front camera, at (1, 0, 0.75).
+    let camera = cell.cameras[0].1.translation.vector;
+    let near = Isometry3::from_parts(
+        (camera + Vector3::new(-0.35, 0.0, 0.0)).into(),
+        nalgebra::UnitQuaternion::from_axis_angle(&Vector3::y_axis(), 1.4),
+    );
+    if let Ok(joints) = arm.solve(&near, &arm.ready) {
+        let mut into = near;
+        into.translation.vector = camera;
+        if let Ok(line) = JointTrajectory::line(arm, &joints, &into, 0.2, 1.0) {
+            let collision = checker(&cell).check(&line, &Scene::default()).unwrap_err();
+            assert!(collision.obstacle.contains("front_camera"), "{collision}");
+        }
+    }
+}
+
+#[test]
+fn what_is_carried_counts_and_contact_is_allowed_only_where_it_is_wanted() {
+    let cell = cell();
+    let checker = checker(&cell);
+    let arm = &cell.arm;
+    let over = |y_m: f64, z_m: f64| Arm::tip_down(&Isometry2::translation(0.5, y_m), z_m);
+    let from = arm.solve(&over(-0.2, 0.12), &arm.ready).unwrap();
+    let line = JointTrajectory::line(arm, &from, &over(0.2, 0.12), 0.5, 2.0).unwrap();
+    let mut heightmap = empty_table();
+    for row in 155..165 {
+        heightmap.height_m[row * 160 + 75..row * 160 + 85].fill(0.08);
+    }
+    let terrain = Terrain::new(&heightmap);
+    let carried = Carried {
+        shape: Shape::Cuboid {
+            size_m: Vector3::new(0.03, 0.03, 0.05),
+        },
+        tip_from_shape: Isometry3::translation(0.0, 0.0, 0.025),
+    };
+    let scene = |carried, contacts| Scene {
+        terrain: Some(&terrain),
+        carried,
+        contacts,
+    };
+    checker.check(&line, &scene(None, vec![])).unwrap();
+    let collision = checker
+        .check(&line, &scene(Some(carried), vec![]))
+        .unwrap_err();
+    assert_eq!(collision.body, "the carried object");
+    // Down onto the block: only with contact wanted there, and up to that height.
+    let above = arm.solve(&over(0.0, 0.2), &arm.ready).unwrap();
+    let descent = JointTrajectory::line(arm, &above, &over(0.0, 0.07), 0.3, 2.0).unwrap();
+    let contact = |up_to_m| Contact {
+        center_m: Point2::new(0.5, 0.0),
+        radius_m: 0.06,
+        up_to_m,
+    };
+    let collision = checker.check(&descent, &scene(None, vec![])).unwrap_err();
+    assert!(collision.obstacle.contains("heightmap"), "{collision}");
+    assert!(
+        checker
+            .check(&descent, &scene(None, vec![contact(0.05)]))
+            .is_err()
+    );
+    checker
+        .check(&descent, &scene(None, vec![contact(0.1)]))
+        .unwrap();
+    // Into the table.
+    let down = JointTrajectory::line(arm, &from, &over(-0.2, -0.01), 0.3, 2.0).unwrap();
+    let collision = checker.check(&down, &Scene::default()).unwrap_err();
+    assert_eq!(
+        (collision.body.as_str(), collision.obstacle.as_str()),
+        ("suction_gripper", "table")
+    );
+    let here = Contact {
+        center_m: Point2::new(0.5, -0.2),
+        radius_m: 0.05,
+        up_to_m: 0.02,
+    };
+    let allowed = Scene {
+        contacts: vec![here],
+        ..Scene::default()
+    };
+    checker.check(&down, &allowed).unwrap();
+}
+
+#[test]
+fn the_arm_does_not_fold_into_itself() {
+    let mut cell = cell();
+    // Its hand would touch that first.
+    cell.collisions.retain(|body| body.link != "table");
+    let arm = &cell.arm;
+    // The elbow closes until the wrist meets the upper arm.
+    let mut folded = arm.ready;
+    folded[2] = 3.0;
+    let way = JointTrajectory::joint_space(arm, &arm.ready, &folded).unwrap();
+    let collision = checker(&cell).check(&way, &Scene::default()).unwrap_err();
+    let links = [collision.body.as_str(), collision.obstacle.as_str()];
+    assert!(
+        links.iter().all(|link| link.contains("link")),
+        "{collision}"
+    );
+}
+
+#[test]
+fn margins_without_sense_are_refused_by_name() {
+    let cell = cell();
+    for (obstacle_m, self_m, name) in [
+        (-0.01, 0.0, "obstacles"),
+        (f64::NAN, 0.0, "obstacles"),
+        (0.01, 0.5, "links"),
+    ] {
+        let error = CollisionChecker::new(&cell, Margins { obstacle_m, self_m })
+            .unwrap_err()
+            .to_string();
+        assert!(error.contains(name), "{error}");
+    }
+}
+
+#[test]
+fn the_ways_home_of_every_shipped_arm_are_free() {
+    let folder = std::path::Path::new(concat!(env!("CARGO_MANIFEST_DIR"), "/../../urdf"));
+    for file in [
+        "workcell.urdf",
+        "workcell_ur3e.urdf",
+        "workcell_ur5e.urdf",
+        "workcell_ur10e.urdf",
+    ] {
+        let cell = WorkCell::load(&folder.join(file)).unwrap();
+        let arm = &cell.arm;
+        let checker = checker(&cell);
+        let (mut free, mut blocked) = (0, Vec::new());
+        for step in 0..40 {
+            let at = Isometry2::translation(
+                0.3 + 0.1 * f64::from(step % 5),
+                -0.35 + 0.1 * f64::from(step / 5),
+            );
+            let Ok(joints) = arm.solve(&Arm::tip_down(&at, 0.15), &arm.ready) else {
+                continue;
+            };
+            let way = JointTrajectory::joint_space(arm, &joints, &arm.home).unwrap();
+            match checker.check(&way, &Scene::default()) {
+                Ok(_) => free += 1,
+                Err(collision) => blocked.push(collision.to_string()),
+            }
+        }
+        println!("{file}: {free} free");
+        assert!(
+            blocked.is_empty() && free > 8,
+            "{file}: {free} free, {blocked:#?}"
+        );
+    }
+}

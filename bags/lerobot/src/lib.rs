@@ -1,4 +1,9 @@
-//! Writes demonstrations as a data set in LeRobot's layout, version 3.0.
+//! Demonstrations as a data set in LeRobot's layout, version 3.0: written, and read back.
+
+mod extra;
+mod import;
+
+pub use import::{Import, ImportError};
 
 use bags::Demonstration;
 use heightmap::Heightmap;
@@ -135,6 +140,7 @@ pub struct DataSet {
     tasks: Vec<String>,
     shape: Option<(usize, usize)>,
     statistics: BTreeMap<&'static str, Vec<Moments>>,
+    extra: extra::Extra,
 }
 
 impl DataSet {
@@ -153,6 +159,7 @@ impl DataSet {
             tasks: Vec::new(),
             shape: None,
             statistics: BTreeMap::new(),
+            extra: extra::Extra::default(),
         })
     }
 
@@ -208,11 +215,8 @@ impl DataSet {
             rewards: Vec::new(),
         };
         for (index, step) in demonstration.steps.iter().enumerate() {
-            let action = [step.action.pick, step.action.place].map(|pose| {
-                let position = pose.translation.vector;
-                [position.x, position.y, pose.rotation.angle()].map(|value| value as f32)
-            });
-            let action = action.concat();
+            let action = extra::numbers(&step.action).map(|value| value as f32);
+            let action = action.to_vec();
             let name = steps.join(format!("step_{index:03}"));
             let path = |ending: &str| PathBuf::from(format!("{}_{ending}", name.display()));
             write(&path("observation.png"), &columns.pictures[index])?;
@@ -256,6 +260,7 @@ impl DataSet {
                 }
             }
         }
+        self.extra.episodes.push(demonstration.into());
         self.frames += count;
         self.episodes.push(place);
         Ok(())
@@ -357,7 +362,10 @@ impl DataSet {
             let path = self.folder.join("meta").join(name);
             write(&path, format!("{value:#}"))?;
         }
-        Ok(())
+        write(
+            &self.folder.join(extra::FILE),
+            json!(self.extra).to_string(),
+        )
     }
 }
 

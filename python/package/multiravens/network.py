@@ -432,6 +432,8 @@ class Policy:
             network = Network(json.loads(head["network"]))
             card = json.loads(head["card"])
             calibration = json.loads(head["calibration"])["weights"] if "calibration" in head else None
+            if calibration is not None and not 4 <= len(calibration) <= 6:
+                raise CheckpointError(f"{path}: calibration: has {len(calibration)} weights, expected 4 to 6")
         except CheckpointError as error:
             prefix = "" if str(error).startswith(str(path)) else f"{path}: "
             raise CheckpointError(f"{prefix}{error}") from error
@@ -499,15 +501,20 @@ class Policy:
         yaw = yaw - 2 * math.pi if yaw > math.pi else yaw
 
         done = None if features.done is None else float(torch.sigmoid(features.done))
-        near = [
-            float(np.clip(scores[np.hypot(x_px - at[0], y_px - at[1]) <= 4.0].astype(float).sum(), 1e-6, 1.0))
-            for scores, at in ((pick_map, pick_px), (place_map, place_px))
-        ]
         success = None
         if self.calibration is not None:
+
+            def within(radius_px: float) -> list[float]:
+                """Logarithms of the probability of picking and of placing so near to the decision."""
+                maps = ((pick_map, pick_px), (place_map, place_px))
+                shares = [scores[np.hypot(x_px - at[0], y_px - at[1]) <= radius_px].sum(dtype=float) for scores, at in maps]
+                return [math.log(min(max(share, 1e-6), 1.0)) for share in shares]
+
+            near, about = within(4.0), within(12.0)
             odds = 0.0 if done is None else float(np.clip(math.log(max(done, 1e-30) / max(1 - done, 1e-30)), -12.0, 12.0))
-            said = [1.0, math.log(near[0]), math.log(near[1]), odds]
-            success = 1 / (1 + math.exp(-sum(weight * part for weight, part in zip(self.calibration, said, strict=True))))
+            said = [1.0, *near, odds, near[0] - about[0], near[1] - about[1]]
+            # An older file has fewer weights: those that it leaves out are 0.
+            success = 1 / (1 + math.exp(-sum(weight * part for weight, part in zip(self.calibration, said, strict=False))))
         poses = [(0.25 + px * pixel, -0.5 + py * pixel) for px, py in (pick_px, place_px)]
         return Decision(
             np.array([*poses[0], 0.0, *poses[1], yaw]),

@@ -1,0 +1,75 @@
+//! `meta/sctn.json`: what the columns of a data set do not hold, for the way back.
+
+use bags::Demonstration;
+use heightmap::Workspace;
+use nalgebra::Isometry2;
+use pick_place::{Outcome, PickPlace, PrimitiveSettings};
+use serde::{Deserialize, Serialize};
+
+/// Path within a data set.
+pub const FILE: &str = "meta/sctn.json";
+
+/// One entry for each episode.
+#[derive(Debug, Default, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Extra {
+    pub episodes: Vec<Episode>,
+}
+
+/// Seeds, workspace and steps of a demonstration.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Episode {
+    pub seed: u64,
+    pub start_seed: u64,
+    pub workspace: Workspace,
+    pub steps: Vec<Step>,
+}
+
+/// A step; the action in 64 bits.
+#[derive(Clone, Debug, Serialize, Deserialize)]
+#[serde(deny_unknown_fields)]
+pub struct Step {
+    /// x (m), y (m), yaw (rad) of the pick, then of the place.
+    pub action: [f64; 6],
+    pub module: String,
+    pub delta_reward: f64,
+    pub outcome: Outcome,
+    pub settings: PrimitiveSettings,
+}
+
+impl From<&Demonstration> for Episode {
+    fn from(demonstration: &Demonstration) -> Self {
+        let steps = demonstration.steps.iter().map(|step| Step {
+            action: numbers(&step.action),
+            module: step.module.clone(),
+            delta_reward: step.delta_reward,
+            outcome: step.outcome,
+            settings: step.settings,
+        });
+        Self {
+            seed: demonstration.seed,
+            start_seed: demonstration.start_seed,
+            workspace: demonstration.last.workspace,
+            steps: steps.collect(),
+        }
+    }
+}
+
+/// x (m), y (m), yaw (rad) of the pick, then of the place.
+pub fn numbers(action: &PickPlace) -> [f64; 6] {
+    let pose = |pose: &Isometry2<f64>| {
+        let position = pose.translation.vector;
+        [position.x, position.y, pose.rotation.angle()]
+    };
+    let ([a, b, c], [d, e, f]) = (pose(&action.pick), pose(&action.place));
+    [a, b, c, d, e, f]
+}
+
+/// The action of [`numbers`].
+pub fn action([x, y, yaw, to_x, to_y, to_yaw]: [f64; 6]) -> PickPlace {
+    PickPlace {
+        pick: Isometry2::new([x, y].into(), yaw),
+        place: Isometry2::new([to_x, to_y].into(), to_yaw),
+    }
+}

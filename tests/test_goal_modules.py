@@ -23,6 +23,49 @@ def test_placing_is_completed_with_a_person_only_watching(start, operator: Opera
     assert outcome["completed"] is True and outcome["reward"] == pytest.approx(1.0), outcome
 
 
+def test_a_demonstration_is_repeated_from_another_start_with_nobody_deciding(start, operator: Operator) -> None:
+    launch = start(
+        "sctn", "launch", "--problem", "stacking", "--seed", 10000, "--demonstration-seed", 10001, "--goal-module", "sequence",
+        "--operator", "watch", "--json",
+    )  # fmt: skip
+    goal = operator.next("goal", accept=lambda goal: goal.step == goal.step_count, timeout_s=200.0)
+    assert goal.previous.rows == goal.heightmap.rows > 0
+    assert launch.wait(120.0) == 0, launch.log()
+    outcome = json.loads(launch.output().splitlines()[-1])
+    assert outcome["completed"] is True and outcome["reward"] == pytest.approx(1.0), outcome
+    assert operator.newest("pick_place").checkpoint == "any_start"
+
+
+def test_only_proposals_that_are_not_sure_to_succeed_wait_for_the_operator(start, operator: Operator) -> None:
+    threshold = 0.9
+    start(
+        "sctn", "launch", "--problem", "stacking", "--seed", 10000, "--demonstration-seed", 10001, "--goal-module", "sequence",
+        "--operator", "none", "--require-approval", "unsure", "--sure-probability", threshold,
+    )  # fmt: skip
+    operator.listeners = 3
+    asked = 0
+    while not (operator.received["goal"] and operator.newest("goal").complete):
+        proposals, results = operator.count("pick_place"), operator.count("step_result")
+        proposal = operator.next("pick_place", max(proposals - 1, 0))
+        if proposal.success_probability < threshold and not has_result(operator, proposal.id):
+            operator.spin(1.0)
+            assert not has_result(operator, proposal.id), "an unsure proposal moved without an approval"
+            assert operator.approve(proposal).outcome == StepResult.PLACED
+            asked += 1
+        operator.until(
+            lambda known=(proposals, results): operator.count("pick_place") > known[0] or operator.newest("goal").complete,
+            "next proposal",
+            timeout_s=60.0,
+        )
+    placed = [result for result in operator.received["step_result"] if result.outcome == StepResult.PLACED]
+    assert 0 < asked < len(placed)
+
+
+def has_result(operator: Operator, proposal_id: int) -> bool:
+    """Whether the executor has said what became of a proposal."""
+    return any(result.proposal_id == proposal_id for result in operator.received["step_result"])
+
+
 def test_a_stop_of_the_watcher_ends_the_motions(start, operator: Operator) -> None:
     start(
         "sctn", "launch", "--problem", "placing", "--seed", 10000, "--goal-module", "image_distance",

@@ -278,7 +278,7 @@ def test_without_required_approvals_a_goal_moves_at_once_and_a_cancel_stops_the_
     domain = free_domain()
     start("sim_workcell", "--ros-args", "-p", "real_time_factor:=1.0", domain=domain)
     start("camera_fusion", "--ros-args", "-p", "use_sim_time:=true", domain=domain)
-    start("suction_executor", "--ros-args", "-p", "use_sim_time:=true", "-p", "require_approval:=false", domain=domain)
+    start("suction_executor", "--ros-args", "-p", "use_sim_time:=true", "-p", "require_approval:=never", domain=domain)
     with Operator(domain) as operator:
         cell = Cell(operator)
         cell.wait_for_executor()

@@ -82,6 +82,12 @@ impl Root {
         self.join("config/checkpoints/ten_problems.safetensors")
     }
 
+    /// The policy that comes with the repository for demonstrations of another start; it is conditioned on the images before and
+    /// after each step.
+    pub fn any_start_checkpoint(&self) -> PathBuf {
+        self.join("config/checkpoints/any_start.safetensors")
+    }
+
     /// The embedding that comes with the repository.
     pub fn shipped_embedding(&self) -> PathBuf {
         self.join("config/checkpoints/embedding.safetensors")

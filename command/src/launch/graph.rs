@@ -1,5 +1,6 @@
 //! Starts the nodes: in this process, or as processes of their own.
 
+use super::operator::RequireApproval;
 use crate::root::Root;
 use anyhow::{Context as _, Result, bail};
 use node_kit::{Context, LifecycleClient, LifecycleError, Node, RosArguments, State, Transition};
@@ -21,8 +22,12 @@ pub struct Settings {
     pub goal_module: String,
     /// Checkpoint for the goal module of that name.
     pub embedding: PathBuf,
-    /// Whether nothing moves, and with the oracle nothing advances, without an operator's word.
+    /// Whether, with the oracle, nothing advances without an operator's decision.
     pub operated: bool,
+    /// Which proposals move only with an approval.
+    pub require_approval: RequireApproval,
+    /// With `unsure`, the probability of success from which a proposal moves unasked.
+    pub sure_probability: f32,
     /// Whether nothing moves while no operator is present.
     pub require_presence: bool,
     /// The operator's console, where there is one.
@@ -78,6 +83,7 @@ impl Settings {
                 ("demonstration", path(&self.demonstration)),
                 ("goal_module", self.goal_module.clone()),
                 ("embedding", path(&self.embedding)),
+                ("checkpoint", path(&self.checkpoint)),
                 ("require_confirmation", self.operated.to_string()),
             ],
             "gctn_policy" => vec![("checkpoint", path(&self.checkpoint))],
@@ -93,7 +99,8 @@ impl Settings {
             },
             "suction_executor" => vec![
                 ("urdf", path(&root.join("urdf/workcell.urdf"))),
-                ("require_approval", self.operated.to_string()),
+                ("require_approval", self.require_approval.name().to_owned()),
+                ("sure_probability", self.sure_probability.to_string()),
                 ("require_presence", self.require_presence.to_string()),
             ],
             _ => Vec::new(),

@@ -15,7 +15,7 @@ use msgs::convert::{self, heightmap_from_msg};
 use msgs::sctn_msgs::{ConfirmationRefused, Goal, PickPlace, Reward, StepConfirmation, StepResult};
 use multiravens::{Environment, EpisodeSeed};
 use node_kit::{Node, Qos, ns_from_stamp, plain_node, wait_for_end};
-use operator::OperatorKind;
+use operator::{OperatorKind, RequireApproval};
 use recording::{LAST_HEIGHTMAP, LAST_WORDS, RunRecorder};
 use serde::Serialize;
 use std::path::{Path, PathBuf};
@@ -33,6 +33,8 @@ const MAX_REFUSALS: u32 = 5;
 
 /// The goal module that an operator answers to.
 const ORACLE: &str = "oracle";
+/// The goal module that asks the policy whether a step is done.
+const SEQUENCE: &str = "sequence";
 /// A run whose last goal is reached may still owe the result and reward of its last step.
 const LAST_RESULT: Duration = Duration::from_secs(5);
 /// Pages learn of the end of the run before their console ends.
@@ -55,9 +57,16 @@ pub struct Launch {
     #[arg(long, value_enum, default_value = "auto")]
     operator: OperatorKind,
     /// What says which goal is next: the operator, or what is seen after a motion
-    #[arg(long, value_parser = ["oracle", "image_distance", "embedding"], default_value = ORACLE)]
+    #[arg(long, value_parser = ["oracle", "image_distance", "embedding", SEQUENCE], default_value = ORACLE)]
     goal_module: String,
-    /// Checkpoint of the policy [default: the shipped one]
+    /// Which proposals the operator approves before they are carried out [default: always; never with --operator watch]
+    #[arg(long, value_enum)]
+    require_approval: Option<RequireApproval>,
+    /// With --require-approval unsure, a proposal of at least this probability of success is carried out unasked
+    #[arg(long, default_value_t = 0.99)]
+    sure_probability: f32,
+    /// Checkpoint of the policy [default: the shipped one; with --demonstration-seed or --goal-module sequence the shipped one for
+    /// any start]
     #[arg(long)]
     checkpoint: Option<PathBuf>,
     /// Checkpoint for the goal module of that name [default: the shipped one]
@@ -145,16 +154,21 @@ impl Launch {
             problems_dir: std::path::absolute(problems_dir)?,
             seed: self.seed,
             demonstration: std::path::absolute(shown)?,
-            checkpoint: self
-                .checkpoint
-                .clone()
-                .unwrap_or_else(|| root.shipped_checkpoint()),
+            checkpoint: self.checkpoint.clone().unwrap_or_else(|| {
+                if self.demonstration_seed.is_some() || self.goal_module == SEQUENCE {
+                    root.any_start_checkpoint()
+                } else {
+                    root.shipped_checkpoint()
+                }
+            }),
             goal_module: self.goal_module.clone(),
             embedding: self
                 .embedding
                 .clone()
                 .unwrap_or_else(|| root.shipped_embedding()),
             operated: self.operator != OperatorKind::Watch,
+            require_approval: self.require_approval(),
+            sure_probability: self.sure_probability,
             require_presence: self.require_presence,
             console: match self.operator {
                 OperatorKind::Web => Some(graph::Console {
@@ -195,6 +209,23 @@ impl Launch {
         Ok(())
     }
 
+    fn require_approval(&self) -> RequireApproval {
+        let usual = match self.operator {
+            OperatorKind::Watch => RequireApproval::Never,
+            _ => RequireApproval::Always,
+        };
+        self.require_approval.unwrap_or(usual)
+    }
+
+    /// Proposals of a lower probability of success, or without one, wait for an approval.
+    fn asks(&self) -> f32 {
+        match self.require_approval() {
+            RequireApproval::Always => f32::INFINITY,
+            RequireApproval::Unsure => self.sure_probability,
+            RequireApproval::Never => f32::NEG_INFINITY,
+        }
+    }
+
     async fn session(
         &self,
         root: &Root,
@@ -214,7 +245,7 @@ impl Launch {
             None => "step_result".to_owned(),
         };
         let confirms = settings.operated && settings.goal_module == ORACLE;
-        let mut desk = Desk::new(&node, &results, confirms)?;
+        let mut desk = Desk::new(&node, &results, confirms, self.asks())?;
         let mut graph = if self.processes {
             Graph::spawn(root, settings, &folder.join("logs"))?
         } else {
@@ -295,6 +326,8 @@ struct Desk {
     node: Node,
     /// Whether the operator says which goal is next.
     confirms: bool,
+    /// See [`Launch::asks`].
+    asks_below: f32,
     /// Whether the last goal is said to be reached.
     goals_reached: bool,
     proposals: node_kit::Subscription<PickPlace>,
@@ -320,10 +353,11 @@ struct Desk {
 
 impl Desk {
     /// `results`: the topic of step results, or of those that are safe.
-    fn new(node: &Node, results: &str, confirms: bool) -> Result<Self> {
+    fn new(node: &Node, results: &str, confirms: bool, asks_below: f32) -> Result<Self> {
         Ok(Self {
             node: node.clone(),
             confirms,
+            asks_below,
             goals_reached: false,
             proposals: node.subscription("pick_place", Qos::Latched)?,
             results: node.subscription(results, Qos::Event)?,
@@ -467,6 +501,7 @@ impl Desk {
         let decision = match kind {
             OperatorKind::None | OperatorKind::Watch | OperatorKind::Web => return Ok(()),
             _ if !self.confirms && matches!(question, Question::Confirm { .. }) => return Ok(()),
+            _ if self.moves_unasked(&question) => return Ok(()),
             OperatorKind::Auto => question.automatic_answer(),
             OperatorKind::Terminal => {
                 let ask = question.clone();
@@ -485,10 +520,24 @@ impl Desk {
         Ok(())
     }
 
+    /// The executor carries the proposal out by itself.
+    fn moves_unasked(&self, question: &Question) -> bool {
+        let Question::Approve(proposal) = question else {
+            return false;
+        };
+        match proposal.success_probability {
+            Some(probability) => probability >= self.asks_below,
+            None => self.asks_below == f32::NEG_INFINITY,
+        }
+    }
+
     fn describe(&self, proposal: &Proposal) {
         let (pick, place) = (&proposal.action.pick, &proposal.action.place);
+        let probability = proposal.success_probability;
+        let probability = probability.map(|probability| format!(", success {probability:.2}"));
+        let probability = probability.unwrap_or_default();
         println!(
-            "step {}/{} attempt {}: {} pick ({:.3}, {:.3}) place ({:.3}, {:.3}, {:.0} deg), scores {:.2} {:.2}",
+            "step {}/{} attempt {}: {} pick ({:.3}, {:.3}) place ({:.3}, {:.3}, {:.0} deg), scores {:.2} {:.2}{probability}",
             proposal.step,
             self.step_count,
             proposal.attempt,

@@ -2,6 +2,28 @@
 
 use clap::ValueEnum;
 
+/// Which proposals an operator approves before they are carried out.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+pub enum RequireApproval {
+    /// Every one
+    Always,
+    /// Those that are not sure to succeed
+    Unsure,
+    /// None, until a stop or a fault
+    Never,
+}
+
+impl RequireApproval {
+    /// As the executor's parameter of that name.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Always => "always",
+            Self::Unsure => "unsure",
+            Self::Never => "never",
+        }
+    }
+}
+
 /// Who decides.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub enum OperatorKind {

@@ -22,6 +22,32 @@ const INVALID: usize = 64;
 /// Confirmations that wait for their proposal; more are refused at once.
 const WAITING: usize = 16;
 
+/// Which proposals move only when somebody approves them.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub enum RequireApproval {
+    /// Every one.
+    Always,
+    /// Those without a probability of success of at least `threshold`.
+    Unsure {
+        /// From 0 to 1.
+        threshold: f32,
+    },
+    /// None, until a stop or a fault.
+    Never,
+}
+
+impl RequireApproval {
+    fn of(&self, proposal: &Proposal) -> bool {
+        match self {
+            Self::Always => true,
+            Self::Unsure { threshold } => !proposal
+                .success_probability
+                .is_some_and(|probability| probability >= *threshold),
+            Self::Never => false,
+        }
+    }
+}
+
 /// What a proposal must keep to.
 #[derive(Clone, Debug, PartialEq)]
 pub struct GateRules {
@@ -35,8 +61,8 @@ pub struct GateRules {
     pub observation_changed_fraction: f64,
     /// How long a confirmation waits for its proposal or its heightmap.
     pub confirmation_grace: Duration,
-    /// Whether proposals move only when somebody approves them.
-    pub require_approval: bool,
+    /// Which proposals move only when somebody approves them.
+    pub require_approval: RequireApproval,
 }
 
 /// Why a message is no proposal that could be approved.
@@ -337,7 +363,7 @@ impl ApprovalGate {
             moving: None,
             homing: false,
             moved_until: None,
-            automatic: !rules.require_approval,
+            automatic: rules.require_approval != RequireApproval::Always,
             rules,
         }
     }
@@ -352,10 +378,18 @@ impl ApprovalGate {
         self.moving
     }
 
-    /// Whether the executor approves new proposals itself: approval is not required, and no stop or fault has come since
-    /// the last approval.
+    /// Whether the executor approves some new proposals itself: approval is not always required, and no stop or fault has come
+    /// since the last approval.
     pub fn is_automatic(&self) -> bool {
         self.automatic
+    }
+
+    /// Whether the executor approves this proposal itself: it is the newest one, and the rules do not ask for an approval of it.
+    pub fn moves_unasked(&self, id: ProposalId) -> bool {
+        let newest = self.newest.as_ref();
+        let newest = newest.filter(|newest| newest.proposal.id == id);
+        self.automatic
+            && newest.is_some_and(|newest| !self.rules.require_approval.of(&newest.proposal))
     }
 
     /// Takes the newest observation.
@@ -690,7 +724,7 @@ impl ApprovalGate {
         self.set_status(id, ProposalStatus::Moving);
         self.moving = Some(id);
         // After a stop or a fault an approval lets things go on.
-        self.automatic = !self.rules.require_approval;
+        self.automatic = self.rules.require_approval != RequireApproval::Always;
         Verdict::Act(GateAction::Move(proposal))
     }
 

@@ -6,9 +6,9 @@ mod parameters;
 
 use std::{path::Path, sync::Arc, time::Duration};
 
-use anyhow::Context as _;
+use anyhow::{Context as _, bail};
 use bags::Demonstration;
-use gctn::{Embedded, Embedding};
+use gctn::{Embedded, Embedding, GoalConditioning, Policy};
 use msgs::{
     convert,
     sctn_msgs::{
@@ -36,7 +36,9 @@ pub async fn configure(node: Node, parameters: GoalOracleParameters) -> anyhow::
         None => GoalSequence::default(),
     };
     let judge = match (parameters.goal_module, parameters.require_confirmation) {
-        (GoalModule::ImageDistance | GoalModule::Embedding, _) => StepJudge::Image,
+        (GoalModule::ImageDistance | GoalModule::Embedding | GoalModule::Sequence, _) => {
+            StepJudge::Image
+        }
         (GoalModule::Oracle, true) => StepJudge::Operator,
         (GoalModule::Oracle, false) => StepJudge::Outcome,
     };
@@ -46,6 +48,17 @@ pub async fn configure(node: Node, parameters: GoalOracleParameters) -> anyhow::
             let embedding = Embedding::load(&parameters.embedding);
             let embedding = embedding.context("parameter embedding")?;
             ImageMatcher::Embedding(Box::new(embedding), Vec::new())
+        }
+        GoalModule::Sequence => {
+            let policy = Policy::load(&parameters.checkpoint).context("parameter checkpoint")?;
+            let conditioning = policy.config().conditioning;
+            if conditioning != GoalConditioning::Sequence {
+                bail!(
+                    "parameter checkpoint: {} is conditioned on {conditioning:?}, expected one trained with conditioning sequence",
+                    parameters.checkpoint.display()
+                );
+            }
+            ImageMatcher::Sequence(Box::new(policy))
         }
     };
     Ok(OracleNode {
@@ -166,7 +179,12 @@ impl Active for OracleNode {
 enum ImageMatcher {
     Distance,
     Embedding(Box<Embedding>, Vec<Embedded>),
+    /// Conditioned on the images before and after a step.
+    Sequence(Box<Policy>),
 }
+
+/// A step is done when the policy gives it at least this probability.
+const DONE: f64 = 0.5;
 
 impl ImageMatcher {
     /// The goals have changed.
@@ -176,11 +194,13 @@ impl ImageMatcher {
         }
     }
 
-    /// How many goals are reached: which of the known images, the first of them that of the start, is nearest.
+    /// How many goals are reached, where it was `before` of them before the motion. `images`: that of the start, then those to be
+    /// reached. By distance and embedding it is the index of the nearest image. None where the matcher cannot say.
     fn reached<'a>(
         &mut self,
         seen: &heightmap::Heightmap,
         images: impl Iterator<Item = &'a heightmap::Heightmap>,
+        before: usize,
     ) -> Result<Option<usize>, gctn::Error> {
         match self {
             Self::Distance => Ok(seen.nearest(images)),
@@ -190,6 +210,24 @@ impl ImageMatcher {
                     *known = embedded.collect::<Result<_, _>>()?;
                 }
                 Ok(Embedding::nearest(&embedding.embed(seen)?, known))
+            }
+            Self::Sequence(policy) => {
+                let images: Vec<_> = images.collect();
+                // Step `index`, from 0, leads from one image to the next.
+                let is_done = |index: usize| match images.get(index..index + 2) {
+                    Some([previous, image]) => policy
+                        .done(seen, gctn::Goal::step(previous, image))
+                        .map(|probability| probability.map(|probability| probability >= DONE)),
+                    _ => Ok(None),
+                };
+                if is_done(before)? == Some(true) {
+                    return Ok(Some(before + 1));
+                }
+                let undone = match before.checked_sub(1) {
+                    Some(last) => is_done(last)? == Some(false),
+                    None => false,
+                };
+                Ok(Some(before - usize::from(undone)))
             }
         }
     }
@@ -292,7 +330,8 @@ impl OracleNode {
         }
         seen.judged = true;
         let heightmap = &seen.observation.heightmap;
-        match self.matcher.reached(heightmap, images) {
+        let (step, _, _) = self.tracker.progress();
+        match self.matcher.reached(heightmap, images, step as usize - 1) {
             Ok(Some(reached)) => self.tracker.on_image_match(reached),
             Ok(None) => Change::None,
             Err(error) => {

@@ -16,6 +16,8 @@ pub enum GoalModule {
     ImageDistance,
     /// The same, where the images lie as a trained network embeds them.
     Embedding,
+    /// A policy conditioned on the sequence says whether the step is done, also from another start.
+    Sequence,
 }
 
 /// Explained in config/goal_oracle.yaml.
@@ -27,6 +29,7 @@ pub struct GoalOracleParameters {
     pub start_empty: bool,
     pub goal_module: GoalModule,
     pub embedding: PathBuf,
+    pub checkpoint: PathBuf,
     pub require_confirmation: bool,
     pub world_frame: String,
 }
@@ -38,6 +41,7 @@ impl Default for GoalOracleParameters {
             start_empty: false,
             goal_module: GoalModule::Oracle,
             embedding: PathBuf::new(),
+            checkpoint: PathBuf::new(),
             require_confirmation: true,
             world_frame: "world".into(),
         }
@@ -71,6 +75,12 @@ impl Parameters for GoalOracleParameters {
                 "expected the path of a checkpoint with goal_module embedding, found nothing",
             ));
         }
+        if self.goal_module == GoalModule::Sequence && self.checkpoint == Path::new("") {
+            return Err(InvalidParameter::new(
+                "checkpoint",
+                "expected the path of a policy's checkpoint with goal_module sequence, found nothing",
+            ));
+        }
         Ok(())
     }
 }
@@ -80,13 +90,19 @@ mod tests {
     use super::*;
 
     #[test]
-    fn without_a_checkpoint_nothing_is_embedded() {
-        let parameters = GoalOracleParameters {
-            goal_module: GoalModule::Embedding,
-            ..GoalOracleParameters::default()
-        };
-        let error = parameters.validate().unwrap_err().to_string();
-        assert!(error.contains("embedding"), "{error}");
+    fn a_goal_module_that_needs_a_checkpoint_is_refused_without_one() {
+        let needs = [
+            (GoalModule::Embedding, "embedding"),
+            (GoalModule::Sequence, "checkpoint"),
+        ];
+        for (goal_module, parameter) in needs {
+            let parameters = GoalOracleParameters {
+                goal_module,
+                ..GoalOracleParameters::default()
+            };
+            let error = parameters.validate().unwrap_err().to_string();
+            assert!(error.contains(parameter), "{error}");
+        }
     }
 
     #[test]

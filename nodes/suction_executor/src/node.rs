@@ -83,7 +83,7 @@ fn rules(parameters: &SuctionExecutorParameters) -> GateRules {
         observation_tolerance_m: parameters.observation_tolerance_m as f32,
         observation_changed_fraction: parameters.observation_changed_fraction,
         confirmation_grace: Duration::from_secs_f64(parameters.confirmation_grace_s),
-        require_approval: parameters.require_approval,
+        require_approval: parameters.require_approval(),
     }
 }
 
@@ -353,7 +353,7 @@ impl Executor<'_> {
         match self.gate.on_proposal(id, read_proposal(&message)) {
             Proposed::Pending => {
                 info!("proposal {id}");
-                if self.gate.is_automatic() {
+                if self.gate.moves_unasked(id) {
                     self.confirm(id, OperatorDecision::Approve);
                 }
             }
@@ -407,7 +407,7 @@ impl Executor<'_> {
             moving: false,
             cancelling: false,
         });
-        if self.gate.is_automatic() {
+        if self.gate.moves_unasked(id) {
             self.confirm(id, OperatorDecision::Approve);
         } else {
             self.feedback(ExecutePickPlaceFeedback::AWAITING_APPROVAL);

@@ -5,13 +5,16 @@ use std::path::PathBuf;
 use node_kit::{Parameters, Range};
 use pick_place::PrimitiveSettings;
 use serde::{Deserialize, Serialize};
+use step_protocol::RequireApproval;
 
 /// Parameters of the node.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct SuctionExecutorParameters {
-    /// Whether every motion needs an operator's approval.
-    pub require_approval: bool,
+    /// Which motions need an operator's approval.
+    pub require_approval: Approval,
+    /// With `unsure`: proposals of at least this probability of success move unasked.
+    pub sure_probability: f64,
     /// Whether nothing moves while no operator is present.
     pub require_presence: bool,
     /// Wall seconds after which an operator who has shown no sign is not present.
@@ -30,6 +33,19 @@ pub struct SuctionExecutorParameters {
     pub confirmation_grace_s: f64,
     /// The driver and its wiring.
     pub driver: Driver,
+}
+
+/// Which motions need an operator's approval.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Approval {
+    /// Every one.
+    #[default]
+    Always,
+    /// Those of proposals that are not sure to succeed.
+    Unsure,
+    /// None, until a stop or a fault.
+    Never,
 }
 
 /// Largest heights and speeds that a proposal may ask for.
@@ -85,7 +101,8 @@ pub struct Driver {
 impl Default for SuctionExecutorParameters {
     fn default() -> Self {
         Self {
-            require_approval: true,
+            require_approval: Approval::Always,
+            sure_probability: 0.99,
             require_presence: false,
             presence_timeout_s: 1.0,
             world_frame: "world".into(),
@@ -152,6 +169,18 @@ const TIME: Range = Range::Float(0.001, 3600.0);
 /// Pins of the control box and the tool.
 const PIN: Range = Range::Integer(0, 17);
 
+impl SuctionExecutorParameters {
+    pub(crate) fn require_approval(&self) -> RequireApproval {
+        match self.require_approval {
+            Approval::Always => RequireApproval::Always,
+            Approval::Unsure => RequireApproval::Unsure {
+                threshold: self.sure_probability as f32,
+            },
+            Approval::Never => RequireApproval::Never,
+        }
+    }
+}
+
 impl Parameters for SuctionExecutorParameters {
     const DOCUMENTATION: &'static str = include_str!("../../../config/suction_executor.yaml");
     const RANGES: &'static [(&'static str, Range)] = &[
@@ -163,6 +192,7 @@ impl Parameters for SuctionExecutorParameters {
         ("limits.acceleration_m_s2", Range::POSITIVE),
         ("observation_tolerance_m", Range::POSITIVE),
         ("observation_changed_fraction", Range::SHARE),
+        ("sure_probability", Range::SHARE),
         ("presence_timeout_s", Range::POSITIVE),
         ("confirmation_grace_s", TIME),
         ("driver.suction_pin", PIN),
@@ -205,7 +235,8 @@ mod tests {
 
     #[test]
     fn approval_is_required_unless_switched_off() {
-        assert!(SuctionExecutorParameters::default().require_approval);
+        let parameters = SuctionExecutorParameters::default();
+        assert_eq!(parameters.require_approval(), RequireApproval::Always);
     }
 
     #[test]

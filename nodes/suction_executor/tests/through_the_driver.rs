@@ -583,8 +583,8 @@ async fn a_lost_driver_is_a_fault() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
-async fn without_require_approval_a_proposal_moves_once_by_itself_until_a_stop() {
-    let automatic = vec![("require_approval", "false".to_owned())];
+async fn when_no_approval_is_required_a_proposal_moves_once_by_itself_until_a_stop() {
+    let automatic = vec![("require_approval", "never".to_owned())];
     let (mut bench, mut environment, _) = proposed(&[], &automatic).await;
     let action = reference().demonstrate().unwrap();
     let (time, settings) = (environment.cell().time(), environment.settings().unwrap());

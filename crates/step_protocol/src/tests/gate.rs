@@ -9,7 +9,7 @@ use pick_place::{PickPlace, PrimitiveSettings};
 
 use crate::{
     ApprovalGate, GateAction, GateRules, OperatorDecision, Proposal, ProposalId, ProposalStatus,
-    Proposed, RobotState, StepOutcome,
+    Proposed, RequireApproval, RobotState, StepOutcome,
 };
 
 const NOW: Duration = Duration::from_secs(100);
@@ -29,7 +29,7 @@ fn rules() -> GateRules {
         observation_tolerance_m: 0.005,
         observation_changed_fraction: 0.001,
         confirmation_grace: GRACE,
-        require_approval: true,
+        require_approval: RequireApproval::Always,
     }
 }
 
@@ -271,7 +271,7 @@ fn what_waits_for_its_proposal_does_not_survive_a_stop_a_fault_or_a_deactivation
 #[test]
 fn nothing_goes_on_by_itself_after_a_stop_or_a_fault_until_something_is_approved() {
     let automatic = GateRules {
-        require_approval: false,
+        require_approval: RequireApproval::Never,
         ..rules()
     };
     let mut gate = ApprovalGate::new(automatic);
@@ -286,6 +286,42 @@ fn nothing_goes_on_by_itself_after_a_stop_or_a_fault_until_something_is_approved
     assert!(gate.is_automatic());
     decide(&mut gate, 8, OperatorDecision::Stop);
     assert!(!gate.is_automatic());
+}
+
+#[test]
+fn only_a_proposal_that_is_sure_enough_moves_unasked_and_none_after_a_stop() {
+    let unsure = GateRules {
+        require_approval: RequireApproval::Unsure { threshold: 0.9 },
+        ..rules()
+    };
+    let mut gate = ApprovalGate::new(unsure);
+    gate.on_heightmap(Duration::from_secs(5), empty());
+    let probabilities = [
+        (7, None, false),
+        (8, Some(0.89), false),
+        (9, Some(f32::NAN), false),
+        (10, Some(0.9), true),
+    ];
+    for (id, success_probability, moves) in probabilities {
+        propose(
+            &mut gate,
+            Proposal {
+                success_probability,
+                ..proposal(id)
+            },
+        );
+        assert_eq!(gate.moves_unasked(ProposalId(id)), moves, "{id}");
+        assert!(!gate.moves_unasked(ProposalId(id - 1)), "{id}");
+    }
+    decide(&mut gate, 10, OperatorDecision::Stop);
+    let sure = Proposal {
+        success_probability: Some(1.0),
+        ..proposal(11)
+    };
+    propose(&mut gate, sure);
+    assert!(!gate.moves_unasked(ProposalId(11)));
+    approve(&mut gate, 11);
+    assert!(gate.is_automatic());
 }
 
 #[test]

@@ -18,8 +18,8 @@ use crate::mutation::{Mutation, plant};
 use crate::{
     ApprovalGate, Change, Confirmation, Coverage, GateAction, GateRules, Goal, GoalSequence,
     GoalTracker, Job, Judgement, Observation, Operator, OperatorDecision, PlannerRules, Prediction,
-    Proposal, ProposalId, ProposalPlanner, ProposalStatus, Proposed, Question, Reward, RobotState,
-    ShownStep, StepJudge, StepOutcome, StepResult, goals_of,
+    Proposal, ProposalId, ProposalPlanner, ProposalStatus, Proposed, Question, RequireApproval,
+    Reward, RobotState, ShownStep, StepJudge, StepOutcome, StepResult, goals_of,
 };
 
 const WORKSPACE: Workspace = Workspace {
@@ -236,7 +236,7 @@ fn gate() -> ApprovalGate {
         observation_tolerance_m: 0.005,
         observation_changed_fraction: 0.001,
         confirmation_grace: GRACE,
-        require_approval: true,
+        require_approval: RequireApproval::Always,
     })
 }
 

@@ -39,6 +39,11 @@ pub const REPAIR_INTERVAL_MAX: Duration = Duration::from_millis(100);
 // one reader. A round always sends at least one sample, even a larger one.
 pub const REPAIR_BATCH_MAX_BYTES: usize = 8192;
 
+// Most bytes of DATAFRAG submessages that answer a NACK_FRAG in one round. With
+// what the kernel counts for each datagram it is half of the receive buffer
+// that Linux gives by default.
+pub const REPAIR_FRAGS_MAX_BYTES: usize = 65536;
+
 // Periodic HEARTBEAT period for reliable Writers. The period is adaptive: while
 // some matched reader is behind (has unacknowledged samples), heartbeats are
 // sent at the FAST period to prompt prompt repair (some peers rely on a

@@ -1,0 +1,26 @@
+"""`sctn evaluate` measures what the graph does: a policy's episodes have the same outcomes in both, retries included."""
+
+from __future__ import annotations
+
+import json
+import pathlib
+
+import pytest
+
+FIRST_SEED = 10000
+EPISODES = 10
+
+
+@pytest.mark.parametrize("problem", ["chaining", "routing"])
+def test_an_episode_has_the_same_outcome_in_the_graph_as_in_the_evaluation(start, tmp_path: pathlib.Path, problem: str) -> None:
+    report = tmp_path / "report.json"
+    evaluation = start("sctn", "evaluate", "--problem", problem, "--episodes", EPISODES, "--seed", FIRST_SEED, "--out", report)
+    assert evaluation.wait(300.0) == 0, evaluation.log()
+    episodes = json.loads(report.read_text())["reports"]
+    assert len(episodes) == EPISODES
+    for episode in episodes:
+        launch = start("sctn", "launch", "--problem", problem, "--seed", episode["seed"], "--json")
+        launch.wait(120.0)
+        outcome = json.loads(launch.output().splitlines()[-1])
+        graph = (outcome["completed"], outcome["reward"], outcome["steps"])
+        assert graph == (episode["completed"], pytest.approx(episode["reward"]), episode["steps"]), episode["seed"]

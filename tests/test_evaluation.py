@@ -7,14 +7,15 @@ import pathlib
 
 import pytest
 
-FIRST_SEED = 10000
+# Some of these episodes fail at a step and go on.
+FIRST_SEED = {"chaining": 10000, "routing": 10020}
 EPISODES = 10
 
 
 @pytest.mark.parametrize("problem", ["chaining", "routing"])
 def test_an_episode_has_the_same_outcome_in_the_graph_as_in_the_evaluation(start, tmp_path: pathlib.Path, problem: str) -> None:
     report = tmp_path / "report.json"
-    evaluation = start("sctn", "evaluate", "--problem", problem, "--episodes", EPISODES, "--seed", FIRST_SEED, "--out", report)
+    evaluation = start("sctn", "evaluate", "--problem", problem, "--episodes", EPISODES, "--seed", FIRST_SEED[problem], "--out", report)
     assert evaluation.wait(300.0) == 0, evaluation.log()
     episodes = json.loads(report.read_text())["reports"]
     assert len(episodes) == EPISODES

@@ -57,6 +57,9 @@ const ARMS: [Arm; 3] = [
 const START: &str = "  <link name=\"base_link_inertia\">";
 const END: &str = "  <link name=\"flange\"/>";
 
+/// Where, turned how, radius (m), length (m), material.
+type Cylinder = ([f64; 3], &'static str, f64, f64, &'static str);
+
 /// A length as short as it can be written.
 fn short(value: f64) -> String {
     let rounded = (value * 1e6).round() / 1e6;
@@ -97,7 +100,7 @@ fn arm(arm: &Arm) -> String {
     } = arm.lengths;
     let radius = |ur5_m: f64| ur5_m * arm.scale;
     let (upright, across, along) = ("0 0 0", "1.5707963267948966 0 0", "0 1.5707963267948966 0");
-    let links: [(&str, Vec<([f64; 3], &str, f64, f64, &str)>); 7] = [
+    let links: [(&str, Vec<Cylinder>); 7] = [
         (
             "base_link_inertia",
             vec![([0.0, 0.0, 0.025], upright, radius(0.075), 0.05, "ur_dark")],

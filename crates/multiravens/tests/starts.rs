@@ -57,7 +57,8 @@ fn check(problem: &str, seed: EpisodeSeed) -> Result<(), TestCaseError> {
     if seed.is_own_start() {
         prop_assert_eq!(furthest_m, 0.0);
     } else {
-        prop_assert!(furthest_m > 1e-3, "the start is the same");
+        // A start of chaining may by chance lie within a millimetre of the own one, as with scene 726389 and start 409796.
+        prop_assert!(furthest_m > 1e-6, "the start is the same");
     }
     Ok(())
 }

@@ -71,6 +71,7 @@ impl Snapshot {
 impl Train {
     pub fn run(self, root: &Root) -> Result<()> {
         let recipe = Recipe::load(&self.recipe)?;
+        let average = recipe.average as usize;
         let snapshots = train(root, recipe, &self.demos, &self.out, self.resume)?;
         let best = snapshots.iter().max_by(|a, b| {
             a.rank()
@@ -79,14 +80,25 @@ impl Train {
         });
         let best = best.context("no snapshot was taken")?;
         let policy = self.out.join("policy.safetensors");
-        std::fs::copy(&best.checkpoint, &policy).with_context(|| policy.display().to_string())?;
+        if average > 1 {
+            let last = snapshots.iter().rev().take(average).rev();
+            let last: Vec<_> = last.map(|one| one.checkpoint.clone()).collect();
+            gctn::average(&last, &policy)?;
+        } else {
+            std::fs::copy(&best.checkpoint, &policy)
+                .with_context(|| policy.display().to_string())?;
+        }
         if self.json {
             println!(
                 "{}",
                 serde_json::json!({ "policy": policy, "best": best, "snapshots": snapshots })
             );
         } else {
-            println!("{}: the snapshot of step {}", policy.display(), best.step);
+            let of = match average {
+                1 => format!("the snapshot of step {}", best.step),
+                count => format!("the mean of the last {count} snapshots"),
+            };
+            println!("{}: {of}", policy.display());
         }
         Ok(())
     }

@@ -40,6 +40,10 @@ pub struct Recipe {
     pub decoded_mb: usize,
     /// Number of snapshots, evenly spread over the training.
     pub snapshots: u64,
+    /// The policy is the mean of the weights of the last so many snapshots; 1: a single one, the best in validation. For a training
+    /// at a constant learning rate.
+    #[serde(default = "one", skip_serializing_if = "is_one")]
+    pub average: u64,
     /// How snapshots are compared.
     pub validation: Validation,
 }
@@ -66,6 +70,14 @@ impl Demonstrations {
 
 fn is_zero(count: &usize) -> bool {
     *count == 0
+}
+
+fn one() -> u64 {
+    1
+}
+
+fn is_one(count: &u64) -> bool {
+    *count == 1
 }
 
 fn is_default(shown: &Shown) -> bool {
@@ -202,6 +214,7 @@ impl Recipe {
             goal_jitter,
             shown,
             snapshots,
+            average,
             validation,
             ..
         } = recipe;
@@ -262,6 +275,14 @@ impl Recipe {
             good,
             snapshots.to_string(),
             "1 to training.steps",
+        )?;
+        let good = (1..=*snapshots).contains(average);
+        field("average", good, average.to_string(), "1 to snapshots")?;
+        field(
+            "average",
+            *average == 1 || validation.episodes == 0,
+            average.to_string(),
+            "1 where validation chooses the snapshot",
         )?;
         let good = validation.seed % 2 == 1 && validation.seed < 10_000;
         field(
@@ -347,6 +368,7 @@ mod tests {
         assert!(changed("snapshots:", "snapshot:").contains("snapshot"));
         assert!(changed("seed: 1}", "seed: 2}").contains("validation.seed is 2"));
         assert!(changed("snapshots: 4", "snapshots: 0").contains("snapshots is 0"));
+        assert!(changed("snapshots: 4", "snapshots: 4\naverage: 5").contains("average is 5"));
         assert!(changed("batch: 4", "batch: 0").contains("batch is 0"));
         assert!(
             changed("snapshots: 4", "snapshots: 4\ngoal_jitter: 1.5")

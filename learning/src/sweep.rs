@@ -227,6 +227,7 @@ impl Sweep {
             shown: Shown::default(),
             decoded_mb: 512,
             snapshots: self.snapshots,
+            average: 1,
             validation: self.validation.clone(),
         }
     }

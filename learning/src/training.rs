@@ -181,6 +181,7 @@ mod tests {
             shown: Shown::default(),
             decoded_mb: 1,
             snapshots: 3,
+            average: 1,
             validation: Validation {
                 episodes: 0,
                 seed: 1,

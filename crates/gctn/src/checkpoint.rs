@@ -8,8 +8,8 @@ use std::io::Write;
 use std::path::{Path, PathBuf};
 use tch::{Kind, Tensor};
 
-use crate::network::Parameters;
-use crate::{Calibration, Error, NetworkConfig};
+use crate::network::{Builder, Model, Parameters};
+use crate::{Calibration, Error, NetworkConfig, Precision};
 
 /// What the maker of a checkpoint says about it: title to text.
 pub type ModelCard = BTreeMap<String, String>;
@@ -246,6 +246,37 @@ pub fn calibrate(from: &Path, to: &Path, calibration: &Calibration) -> Result<()
         path: to.into(),
         source,
     })
+}
+
+/// Writes the mean of the weights of checkpoints of one network, in 16-bit floats, with the card of the last one: what a training
+/// at a constant learning rate wanders about (stochastic weight averaging, Izmailov et al., UAI 2018).
+pub fn average(from: &[PathBuf], to: &Path) -> Result<(), Error> {
+    let Some(last) = from.last() else {
+        return Err(Error::Config {
+            what: "checkpoints to average",
+            actual: "0".into(),
+            expected: "at least 1",
+        });
+    };
+    let (_, config, mut card) = open(last)?;
+    let weights = || {
+        let builder = Builder::empty(tch::Device::Cpu);
+        Model::new(&config, builder, Precision::F32).parameters
+    };
+    let mean = weights();
+    for path in from {
+        let (file, other, _) = open(path)?;
+        if other != config {
+            let [other, config] = [&other, &config].map(json);
+            return Err(file.error(format!("it is of the network {other}, expected {config}")));
+        }
+        let one = weights();
+        file.fill(&one.entries)?;
+        let share = one.flat / from.len() as f64;
+        let _ = tch::no_grad(|| mean.flat.shallow_clone().f_add_(&share))?;
+    }
+    card.insert("mean of".into(), format!("{} snapshots", from.len()));
+    save(to, Storage::F16, &config, &mean, &card)
 }
 
 /// Reads the head of a network's file: its configuration and its card.

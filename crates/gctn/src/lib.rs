@@ -20,7 +20,7 @@ mod sample;
 mod trainer;
 
 pub use calibration::{Calibration, Evidence, Verdict};
-pub use checkpoint::{ModelCard, Storage, calibrate};
+pub use checkpoint::{ModelCard, Storage, average, calibrate};
 pub use config::{
     Augmentation, Compact, Device, EmbeddingConfig, EmbeddingTraining, GoalConditioning, GrConvnet,
     Interpolation, Matching, Network, NetworkConfig, PlaceLoss, Precision, Resnet43, Schedule,

@@ -241,6 +241,70 @@ fn a_calibrated_checkpoint_decides_the_same_and_says_how_likely_it_is() {
 }
 
 #[test]
+fn the_mean_of_checkpoints_lies_between_them_and_is_of_one_network() {
+    let (folder, path) = saved(Storage::F32);
+    let path_of = |name: &str| folder.path().join(name);
+    // The same weights with another sign of one bias: their mean is 0 there, and the same everywhere else.
+    let bytes = std::fs::read(&path).unwrap();
+    let tensors = SafeTensors::deserialize(&bytes).unwrap();
+    let values = |bytes: &[u8], name: &str| -> Vec<f32> {
+        let tensors = SafeTensors::deserialize(bytes).unwrap();
+        let tensor = tensors.tensor(name).unwrap();
+        match tensor.dtype() {
+            Dtype::F32 => tensor
+                .data()
+                .chunks_exact(4)
+                .map(|number| f32::from_le_bytes(number.try_into().unwrap()))
+                .collect(),
+            _ => panic!("expected 32-bit floats"),
+        }
+    };
+    let name = "pick.bias";
+    let turned: Vec<u8> = values(&bytes, name)
+        .iter()
+        .flat_map(|value| (-value).to_le_bytes())
+        .collect();
+    let views = tensors.tensors().into_iter().map(|(known, view)| {
+        let data = if known == name {
+            &turned[..]
+        } else {
+            view.data()
+        };
+        let view = TensorView::new(view.dtype(), view.shape().to_vec(), data);
+        (known, view.unwrap())
+    });
+    let (_, header) = SafeTensors::read_metadata(&bytes).unwrap();
+    let other = safetensors::serialize(views, header.metadata().clone()).unwrap();
+    std::fs::write(path_of("other"), other).unwrap();
+    let mean = path_of("mean");
+    gctn::average(&[path.clone(), path_of("other")], &mean).unwrap();
+    let [one, mean_of_both] = [&path, &mean].map(|path| Policy::load(path).unwrap());
+    assert_eq!(mean_of_both.card()["mean of"], "2 snapshots");
+    let [observation, goal] = scene();
+    let decide = |policy: &Policy| policy.decide(&observation, &goal, &[]).unwrap();
+    // A bias of all picks alike changes no probability.
+    let [before, after] = [decide(&one), decide(&mean_of_both)];
+    assert!((before.pick_score - after.pick_score).abs() < 1e-3);
+    let stored = std::fs::read(&mean).unwrap();
+    let stored = SafeTensors::deserialize(&stored).unwrap();
+    assert_eq!(stored.tensor(name).unwrap().data(), [0, 0]);
+
+    let another = path_of("another");
+    let network = NetworkConfig {
+        rotations: 5,
+        ..trainer().network().clone()
+    };
+    let another_trainer = Trainer::new(&network, &TrainingConfig::compact()).unwrap();
+    another_trainer
+        .save_checkpoint(&another, Storage::F32, &ModelCard::new())
+        .unwrap();
+    let error = gctn::average(&[another, path], &path_of("none")).unwrap_err();
+    assert!(error.to_string().contains("another"), "{error}");
+    let error = gctn::average(&[], &path_of("none")).unwrap_err();
+    assert!(error.to_string().contains("at least 1"), "{error}");
+}
+
+#[test]
 fn the_matching_network_is_refused_without_a_sequence() {
     let network = NetworkConfig {
         conditioning: GoalConditioning::NextStep,

@@ -37,7 +37,7 @@ def test_a_demonstration_is_repeated_from_another_start_with_nobody_deciding(sta
 
 
 def test_only_proposals_that_are_not_sure_to_succeed_wait_for_the_operator(start, operator: Operator) -> None:
-    threshold = 0.9
+    threshold = 0.975
     start(
         "sctn", "launch", "--problem", "stacking", "--seed", 10000, "--demonstration-seed", 10001, "--goal-module", "sequence",
         "--operator", "none", "--require-approval", "unsure", "--sure-probability", threshold,

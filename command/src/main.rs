@@ -5,6 +5,7 @@ mod bench;
 mod camera_stream;
 mod console;
 mod curves;
+mod decide;
 mod demos;
 mod embed;
 mod evaluate;
@@ -18,6 +19,7 @@ mod launch;
 mod picture;
 mod problems;
 mod progress;
+mod publish;
 mod reliability;
 mod root;
 mod search;
@@ -46,6 +48,8 @@ enum Command {
     Bag(bag::Bag),
     /// Time the inner loops
     Bench(bench::Bench),
+    /// Print, as JSON, what a policy decides before each step of a demonstration
+    Decide(decide::Decide),
     /// Make demonstrations of a problem, and keep the successful ones as bags
     Demos(demos::Demos),
     /// Draw problems of the module arranging at random, and write their files
@@ -74,6 +78,8 @@ enum Command {
     Launch(launch::Launch),
     /// Serve the operator's page for a graph that runs, simulated or real
     Console(console::ConsoleCommand),
+    /// Write a checkpoint and its results as a folder in the layout of the Hugging Face hub; nothing is uploaded
+    Publish(publish::Publish),
     /// Draw what the cameras, the fusion, the demonstrator and the policy make of a problem
     Picture(picture::Picture),
 }
@@ -87,6 +93,7 @@ fn main() -> Result<ExitCode> {
         Command::Bag(bag) => return bag.run(),
         Command::Reliability(reliability) => reliability.run(),
         Command::Bench(bench) => bench.run(&root()?),
+        Command::Decide(decide) => decide.run(&root()?),
         Command::Demos(demos) => demos.run(&root()?),
         Command::Problems(problems) => problems.run(&root()?),
         Command::Health(health) => health.run(&root()?),
@@ -100,6 +107,7 @@ fn main() -> Result<ExitCode> {
         Command::Evaluate(evaluate) => evaluate.run(&root()?),
         Command::Launch(launch) => launch.run(&root()?),
         Command::Console(console) => console.run(&root()?),
+        Command::Publish(publish) => publish.run(&root()?),
         Command::Picture(picture) => picture.run(&root()?),
     }?;
     Ok(ExitCode::SUCCESS)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import pathlib
 
 import gymnasium
@@ -59,6 +60,23 @@ def test_a_recorded_run_is_a_demonstration_too():
     run = multiravens.read_demonstration(REPOSITORY / "bags/sample/placing")
     assert len(run) > 0
     assert run.goals
+
+
+def test_a_data_set_of_lerobot_s_layout_comes_back_as_bags(sctn, tmp_path):
+    sctn("demos", "--problem", "stacking", "--episodes", 2, "--seed", 20_000, "--out", tmp_path / "demos")
+    bags = [tmp_path / f"demos/stacking/{seed:06}" for seed in (20_000, 20_002)]
+    sctn("bag", "export", *bags, "--out", tmp_path / "set")
+    report = json.loads(sctn("bag", "import", tmp_path / "set", "--out", tmp_path / "again", "--json"))
+    assert (report["episodes"], report["frames"]) == (2, 12)
+    for bag in bags:
+        before = multiravens.read_demonstration(bag)
+        after = multiravens.read_demonstration(tmp_path / "again/stacking" / bag.name)
+        assert np.array_equal(after.colors, before.colors)
+        assert np.array_equal(after.heights, before.heights)
+        assert np.allclose(after.actions, before.actions, rtol=0, atol=1e-14)
+        assert np.allclose(after.rewards, before.rewards, rtol=0, atol=1e-14)
+        for name in ("problem", "seed", "start_seed", "modules", "outcomes", "goals"):
+            assert getattr(after, name) == getattr(before, name)
 
 
 def test_what_is_no_demonstration_is_refused_by_name(tmp_path):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.metadata
+import json
 import pathlib
 import subprocess
 import sys
@@ -57,6 +58,15 @@ def test_the_transporter_example_learns_and_acts(torch):
     assert "completed" in out
 
 
-@pytest.mark.parametrize("name", ["random_actions", "transporter"])
+def test_the_evaluation_example_says_what_sctn_evaluate_says(torch, sctn):
+    checkpoint = FOLDER.parent / "config/checkpoints/any_start.safetensors"
+    arguments = ["--problem", "stacking", "--episodes", "3", "--seed", "10000", "--start", "other"]
+    measured = json.loads(sctn("evaluate", "--checkpoint", checkpoint, *arguments, "--json"))
+    lines = run("examples/evaluate_checkpoint.py", str(checkpoint), *arguments).splitlines()
+    expected = [f"seed {one['seed']}: {one['steps']} steps, reward {one['reward']:.3f}" for one in measured["reports"]]
+    assert lines[:-1] == expected
+
+
+@pytest.mark.parametrize("name", ["random_actions", "transporter", "evaluate_checkpoint"])
 def test_each_example_says_how_it_is_run(name):
     assert f"python examples/{name}.py" in (FOLDER / f"examples/{name}.py").read_text().splitlines()[0]

@@ -2,6 +2,7 @@
 
 mod bench;
 mod export;
+mod import;
 mod play;
 mod record;
 
@@ -40,6 +41,8 @@ enum Command {
     Recover(Recover),
     /// Write demonstrations and recorded runs as a data set for LeRobot, and as pictures and arrays
     Export(export::Export),
+    /// Write the episodes of such a data set as bags
+    Import(import::Import),
     /// Measure the writer beside the disk, and a recording of three cameras
     Bench(bench::Bench),
 }
@@ -104,6 +107,7 @@ impl Bag {
             Command::Verify(verify) => verify.run(),
             Command::Recover(recover) => recover.run(),
             Command::Export(export) => export.run(),
+            Command::Import(import) => import.run(),
             Command::Bench(bench) => bench.run(),
         }
     }

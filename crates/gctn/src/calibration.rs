@@ -5,10 +5,11 @@ use serde::{Deserialize, Serialize};
 
 use crate::{Decision, Error, ScoreMap};
 
-/// Scores within this distance of a decision's poses count for it.
-const NEAR_PX: f64 = 4.0;
+/// Scores within this distance of a decision's poses count for it. A little more than 4 cells, so that no last bit says whether the
+/// cells at that distance count.
+const NEAR_PX: f64 = 4.001;
 /// Scores within this distance are of the same object: a decision between them is one between its parts.
-const ABOUT_PX: f64 = 12.0;
+const ABOUT_PX: f64 = 12.001;
 /// The least score that has a logarithm here.
 const LEAST: f64 = 1e-6;
 

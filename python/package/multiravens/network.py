@@ -510,7 +510,7 @@ class Policy:
                 shares = [scores[np.hypot(x_px - at[0], y_px - at[1]) <= radius_px].sum(dtype=float) for scores, at in maps]
                 return [math.log(min(max(share, 1e-6), 1.0)) for share in shares]
 
-            near, about = within(4.0), within(12.0)
+            near, about = within(4.001), within(12.001)
             odds = 0.0 if done is None else float(np.clip(math.log(max(done, 1e-30) / max(1 - done, 1e-30)), -12.0, 12.0))
             said = [1.0, *near, odds, near[0] - about[0], near[1] - about[1]]
             # An older file has fewer weights: those that it leaves out are 0.

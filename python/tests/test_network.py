@@ -57,8 +57,10 @@ def test_a_policy_decides_what_the_rust_side_decides(name, network, shown, sctn)
         for score in ("pick_score", "place_score", "done", "success"):
             ours, theirs = getattr(decision, score), rust[score]
             assert (ours is None) == (theirs is None)
-            # The logits of places are sums of some 100,000 products in single precision: another order of summation moves them by up to 4e-5.
-            assert theirs is None or abs(ours - theirs) < (5e-5 * theirs if score == "place_score" else 1e-5)
+            # The logits of places are sums of some 100,000 products in single precision: another order of
+            # summation moves them by up to 4e-5.
+            tolerance = 5e-5 * theirs if score == "place_score" else 1e-5
+            assert theirs is None or abs(ours - theirs) < tolerance
         assert abs(decision.pick_map.sum() - 1) < 1e-4
     assert (expected[0]["done"] is not None) == (expected[0]["success"] is not None) == (name == "any_start")
 

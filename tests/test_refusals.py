@@ -61,7 +61,7 @@ class Cell:
             origin=Point(x=0.25, y=-0.5, z=0.0),
             z_min_m=0.0,
             z_max_m=0.28,
-            rgb=np.zeros(3 * ROWS * COLS, dtype=np.uint8),
+            rgb=np.full(3 * ROWS * COLS, 100, dtype=np.uint8),
             height_m=np.zeros(ROWS * COLS, dtype=np.float32),
             views=3,
             coverage=1.0,

@@ -2,7 +2,9 @@
 
 mod bag;
 mod bench;
+mod calibrate;
 mod camera_stream;
+mod check;
 mod console;
 mod curves;
 mod decide;
@@ -80,6 +82,10 @@ enum Command {
     Console(console::ConsoleCommand),
     /// Write a checkpoint and its results as a folder in the layout of the Hugging Face hub; nothing is uploaded
     Publish(publish::Publish),
+    /// Find where the cameras stand, from images of a board of AprilTags at the tool
+    Calibrate(calibrate::Calibrate),
+    /// Check a real or simulated cell: table, cameras, noise, clocks, reach; exit code 1 if something is red
+    Check(check::Check),
     /// Draw what the cameras, the fusion, the demonstrator and the policy make of a problem
     Picture(picture::Picture),
 }
@@ -106,6 +112,8 @@ fn main() -> Result<ExitCode> {
         Command::Table(table) => table.run(&root()?),
         Command::Evaluate(evaluate) => evaluate.run(&root()?),
         Command::Launch(launch) => launch.run(&root()?),
+        Command::Calibrate(calibrate) => calibrate.run(&root()?),
+        Command::Check(check) => return check.run(&root()?),
         Command::Console(console) => console.run(&root()?),
         Command::Publish(publish) => publish.run(&root()?),
         Command::Picture(picture) => picture.run(&root()?),

@@ -27,6 +27,17 @@ pub struct Bag {
     command: Command,
 }
 
+/// Records topics of the running graph for some seconds.
+pub fn record_topics(
+    topics: Vec<String>,
+    out: &std::path::Path,
+    seconds: f64,
+    use_sim_time: bool,
+) -> Result<()> {
+    record::Record::of_topics(topics, out, seconds, use_sim_time).run()?;
+    Ok(())
+}
+
 #[derive(Subcommand)]
 enum Command {
     /// Record topics of any type; exit code 3 if messages were lost on the way to the disk, or it was full

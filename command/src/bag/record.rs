@@ -8,7 +8,7 @@ use clap::Args;
 use node_kit::{plain_node, wait_for_end};
 use regex::RegexSet;
 use std::io::{IsTerminal, Write};
-use std::path::PathBuf;
+use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::time::{Duration, Instant};
 
@@ -63,6 +63,26 @@ pub struct Record {
 }
 
 impl Record {
+    /// Records these topics for so many seconds.
+    pub fn of_topics(topics: Vec<String>, out: &Path, seconds: f64, use_sim_time: bool) -> Self {
+        Self {
+            topics,
+            all: false,
+            regex: Vec::new(),
+            exclude: Vec::new(),
+            hidden: false,
+            out: out.to_owned(),
+            compression: CompressionName::None,
+            split_size: None,
+            split_duration: None,
+            duration: Some(seconds),
+            queue: 192,
+            min_free: 64,
+            use_sim_time,
+            json: false,
+        }
+    }
+
     pub fn run(self) -> Result<ExitCode> {
         let runtime = tokio::runtime::Builder::new_multi_thread()
             .enable_all()

@@ -187,6 +187,23 @@ impl CollisionChecker {
         })
     }
 
+    /// The margins.
+    pub fn margins(&self) -> Margins {
+        self.margins
+    }
+
+    /// Largest distance of the tool from its own axis, below the flange.
+    pub(crate) fn tool_radius_m(&self) -> f64 {
+        let tool = self
+            .moving
+            .iter()
+            .filter(|part| part.carrier == Some(TOOL) && part.pose.translation.z > 0.0);
+        let across = tool.map(|part| {
+            part.pose.translation.vector.xy().norm() + part.shape.extent_m(&Vector3::x())
+        });
+        across.fold(0.0, f64::max)
+    }
+
     /// Whether the arm may follow a trajectory through a scene.
     ///
     /// # Errors

@@ -2,10 +2,12 @@
 
 mod checker;
 mod lift_out;
+mod rehearsal;
 mod terrain;
 
 pub use checker::{
     Carried, Clearance, Collision, CollisionChecker, Contact, Margins, MarginsError, Scene,
 };
 pub use lift_out::lift_out;
+pub use rehearsal::rehearse;
 pub use terrain::Terrain;

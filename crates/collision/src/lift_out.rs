@@ -9,6 +9,8 @@ use ur5::Shape;
 const STEP_M: f32 = 0.006;
 /// Cells further from the pick belong to something else, the table for instance.
 const REACH_M: f64 = 0.15;
+/// How far from its axis the cup holds a part of something larger.
+const AT_THE_CUP_M: f64 = 0.02;
 
 /// The object under a pick and the heightmap without it. `tip` is the pose of the suction tip at the contact: the box is fixed to it. Where it
 /// stood the heightmap is as high as the highest of the lower cells around it.
@@ -55,6 +57,14 @@ pub fn lift_out(heightmap: &Heightmap, tip: &Isometry3<f64>) -> Option<(Carried,
                 border.push(side);
             }
         }
+    }
+    // No step sets it apart from what is around it: a cable, or something as flat as the table's noise. What hangs at the cup counts.
+    if object
+        .iter()
+        .any(|index| (center(*index) - pick).norm() > REACH_M - 2.0 * workspace.pixel_size_m)
+    {
+        object.retain(|index| (center(*index) - pick).norm() < AT_THE_CUP_M);
+        border.clear();
     }
     let height = |index: &usize| heightmap.height_m[*index];
     let lowest_m = object.iter().map(height).fold(f32::INFINITY, f32::min);

@@ -90,7 +90,7 @@ fn free_place(
 }
 
 #[test]
-#[ignore = "takes minutes, and the rates of ChangeRules::default() are not tuned yet"]
+#[ignore = "takes minutes"]
 fn no_untouched_scene_counts_as_changed_and_a_small_object_beside_the_place_always_does() {
     let realsense = model("realsense");
     let rules = ChangeRules::default();

@@ -7,7 +7,7 @@ use std::collections::VecDeque;
 use std::sync::Arc;
 use std::time::Duration;
 
-use heightmap::{Heightmap, Workspace};
+use heightmap::{Change, ChangeRules, Heightmap, Workspace, largest_change};
 use pick_place::{PickPlace, PrimitiveSettings};
 
 use crate::mutation::{Mutation, planted};
@@ -55,14 +55,20 @@ pub struct GateRules {
     pub frame: String,
     /// Largest heights and speeds.
     pub limits: PrimitiveSettings,
-    /// A cell of the heightmap has changed when its height differs by more.
-    pub observation_tolerance_m: f32,
-    /// The observation has changed when more than this share of its cells has.
-    pub observation_changed_fraction: f64,
+    /// When the observation has changed.
+    pub changes: ChangeRules,
     /// How long a confirmation waits for its proposal or its heightmap.
     pub confirmation_grace: Duration,
     /// Which proposals move only when somebody approves them.
     pub require_approval: RequireApproval,
+}
+
+/// What has become of the cells of a change.
+fn how(change: &Change) -> String {
+    match change.height_m {
+        Some(height_m) => format!("by {:.0} mm", 1e3 * height_m),
+        None => "cannot be seen any more".into(),
+    }
 }
 
 /// Why a message is no proposal that could be approved.
@@ -221,22 +227,20 @@ pub enum Refusal {
     },
     /// The workspace does not look as it did.
     #[error(
-        "proposal {id}: the observation has changed since: {:.2} % of the cells of the heightmap of {} by more than {tolerance_m} m, expected at most {:.2} %",
-        100.0 * fraction,
-        seconds(*stamp),
-        100.0 * limit
+        "proposal {id}: the observation has changed since: {:.0} mm^2 about ({:.3}, {:.3}) {} in the heightmap of {}",
+        1e6 * change.area_m2,
+        change.center_m.x,
+        change.center_m.y,
+        how(change),
+        seconds(*stamp)
     )]
     ObservationChanged {
         /// The proposal.
         id: ProposalId,
         /// Of the newest heightmap.
         stamp: Duration,
-        /// Share of the cells that have changed.
-        fraction: f64,
-        /// By more than this.
-        tolerance_m: f32,
-        /// Share that would do.
-        limit: f64,
+        /// Where and how much.
+        change: Change,
     },
     /// It waited for its proposal when a stop came.
     #[error("proposal {id}: a stop came before it")]
@@ -764,25 +768,20 @@ impl ApprovalGate {
             return Err(Verdict::Wait(Refusal::NoSourceHeightmap { id, stamp }));
         };
         let stamp = *latest_stamp;
-        if source.workspace != latest.workspace {
-            return Err(Verdict::Refuse(Refusal::OtherWorkspace { id, stamp }));
-        }
         // The first heightmap may have come after the proposal.
         check_inside(&newest.proposal, Some(source.workspace))
             .map_err(|reason| Verdict::Refuse(reason.into()))?;
-        let tolerance_m = self.rules.observation_tolerance_m;
-        let limit = self.rules.observation_changed_fraction;
-        let fraction = source.changed_fraction(latest, tolerance_m);
-        if fraction > limit {
-            return Err(Verdict::Refuse(Refusal::ObservationChanged {
+        let PickPlace { pick, place } = newest.proposal.action;
+        let around = [pick, place].map(|pose| pose.translation.vector.into());
+        match largest_change(source, latest, &self.rules.changes, &around) {
+            Ok(None) => Ok(()),
+            Ok(Some(change)) => Err(Verdict::Refuse(Refusal::ObservationChanged {
                 id,
                 stamp,
-                fraction,
-                tolerance_m,
-                limit,
-            }));
+                change,
+            })),
+            Err(_) => Err(Verdict::Refuse(Refusal::OtherWorkspace { id, stamp })),
         }
-        Ok(())
     }
 
     /// Where a proposal stands; none if it is unknown or invalid.

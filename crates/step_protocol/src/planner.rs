@@ -3,8 +3,8 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use heightmap::{Disk, Heightmap};
-use nalgebra::Isometry2;
+use heightmap::{ChangeRules, Disk, Heightmap, largest_change};
+use nalgebra::{Isometry2, Point2};
 use pick_place::PickPlace;
 
 use crate::mutation::{Mutation, planted};
@@ -44,10 +44,8 @@ pub struct Prediction {
 /// How a planner proposes.
 #[derive(Clone, Debug, PartialEq)]
 pub struct PlannerRules {
-    /// A cell of the heightmap has changed when its height differs by more.
-    pub observation_tolerance_m: f32,
-    /// The observation has changed when more than this share of its cells has.
-    pub observation_changed_fraction: f64,
+    /// When the observation has changed.
+    pub changes: ChangeRules,
     /// Picks are left out within this distance of one that the operator rejected.
     pub rejected_radius_m: f64,
     /// Name of the checkpoint, for the proposals.
@@ -79,6 +77,7 @@ struct Pending {
     observation: Observation,
     id: ProposalId,
     pick: Isometry2<f64>,
+    place: Isometry2<f64>,
     /// Its approval was refused: a newer observation gives a newer proposal, changed or not.
     refused: bool,
 }
@@ -341,6 +340,7 @@ impl ProposalPlanner {
                     observation,
                     id: proposal.id,
                     pick: prediction.pick,
+                    place: prediction.place,
                     refused: false,
                 });
                 Ok(proposal)
@@ -361,17 +361,19 @@ impl ProposalPlanner {
         if goal.complete || newest.stamp < goal.stamp || self.outdated {
             return None;
         }
-        let is_due = |seen: &Observation| {
+        let is_due = |seen: &Observation, around: &[Point2<f64>]| {
             let moved = seen.stamp < self.moved_until && newest.stamp >= self.moved_until;
-            moved || self.rules.has_changed(seen, newest)
+            moved || self.rules.has_changed(seen, newest, around)
         };
         let due = match &self.progress {
             Progress::Waiting => true,
             Progress::Proposed(pending) => {
                 let seen = &pending.observation;
-                is_due(seen) || (pending.refused && newest.stamp > seen.stamp)
+                let poses = [pending.pick, pending.place];
+                let around = poses.map(|pose| pose.translation.vector.into());
+                is_due(seen, &around) || (pending.refused && newest.stamp > seen.stamp)
             }
-            Progress::Failed(seen) => is_due(seen),
+            Progress::Failed(seen) => is_due(seen, &[]),
             Progress::Predicting(_) | Progress::Approved(_) | Progress::Closed => false,
         };
         if !due {
@@ -393,12 +395,16 @@ impl ProposalPlanner {
 }
 
 impl PlannerRules {
-    fn has_changed(&self, before: &Observation, after: &Observation) -> bool {
+    fn has_changed(
+        &self,
+        before: &Observation,
+        after: &Observation,
+        around: &[Point2<f64>],
+    ) -> bool {
         let (old, new) = (&before.heightmap, &after.heightmap);
+        // Another workspace is a change too.
         before.stamp != after.stamp
-            && (old.workspace != new.workspace
-                || old.changed_fraction(new, self.observation_tolerance_m)
-                    > self.observation_changed_fraction)
+            && !matches!(largest_change(old, new, &self.changes, around), Ok(None))
     }
 }
 

@@ -13,6 +13,7 @@ use std::{
 
 use anyhow::{Context as _, bail};
 use gctn::{Decision, GoalConditioning, Policy};
+use heightmap::ChangeRules;
 use msgs::{
     convert,
     sctn_msgs::{Goal, Heightmap, PickPlace, StepConfirmation, StepResult},
@@ -170,8 +171,10 @@ fn confirm(planner: &mut ProposalPlanner, message: &StepConfirmation) {
 fn rules_of(parameters: &GctnPolicyParameters, node: &Node) -> PlannerRules {
     let checkpoint = parameters.checkpoint.file_stem().unwrap_or_default();
     PlannerRules {
-        observation_tolerance_m: parameters.observation_tolerance_m as f32,
-        observation_changed_fraction: parameters.observation_changed_fraction,
+        changes: ChangeRules::new(
+            parameters.observation_tolerance_m,
+            1e-6 * parameters.observation_changed_area_mm2,
+        ),
         rejected_radius_m: parameters.exclusion_radius_m,
         checkpoint: checkpoint.to_string_lossy().into_owned(),
         author: node.name().to_owned(),

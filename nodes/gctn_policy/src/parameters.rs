@@ -14,7 +14,7 @@ pub struct GctnPolicyParameters {
     pub threads: usize,
     pub exclusion_radius_m: f64,
     pub observation_tolerance_m: f64,
-    pub observation_changed_fraction: f64,
+    pub observation_changed_area_mm2: f64,
 }
 
 impl Default for GctnPolicyParameters {
@@ -24,7 +24,7 @@ impl Default for GctnPolicyParameters {
             threads: 1,
             exclusion_radius_m: 0.02,
             observation_tolerance_m: 0.005,
-            observation_changed_fraction: 0.001,
+            observation_changed_area_mm2: 75.0,
         }
     }
 }
@@ -48,10 +48,10 @@ impl Parameters for GctnPolicyParameters {
         ("threads", Range::Integer(1, 256)),
         ("exclusion_radius_m", Range::POSITIVE),
         ("observation_tolerance_m", Range::POSITIVE),
-        ("observation_changed_fraction", Range::SHARE),
+        ("observation_changed_area_mm2", Range::POSITIVE),
     ];
     const CHANGEABLE: &'static [&'static str] =
-        &["observation_tolerance_m", "observation_changed_fraction"];
+        &["observation_tolerance_m", "observation_changed_area_mm2"];
 }
 
 #[cfg(test)]

@@ -5,6 +5,7 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use anyhow::Context as _;
+use heightmap::ChangeRules;
 use msgs::convert;
 use msgs::sctn_msgs::{self, ExecutePickPlace, ExecutePickPlaceFeedback, ExecutePickPlaceResult};
 use msgs::sensor_msgs::JointState;
@@ -80,8 +81,10 @@ fn rules(parameters: &SuctionExecutorParameters) -> GateRules {
     GateRules {
         frame: parameters.world_frame.clone(),
         limits: parameters.limits.settings(),
-        observation_tolerance_m: parameters.observation_tolerance_m as f32,
-        observation_changed_fraction: parameters.observation_changed_fraction,
+        changes: ChangeRules::new(
+            parameters.observation_tolerance_m,
+            1e-6 * parameters.observation_changed_area_mm2,
+        ),
         confirmation_grace: Duration::from_secs_f64(parameters.confirmation_grace_s),
         require_approval: parameters.require_approval(),
     }

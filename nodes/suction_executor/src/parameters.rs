@@ -27,8 +27,8 @@ pub struct SuctionExecutorParameters {
     pub limits: Limits,
     /// A cell of the heightmap has changed when its height differs by more.
     pub observation_tolerance_m: f64,
-    /// The observation has changed when more than this share of its cells has.
-    pub observation_changed_fraction: f64,
+    /// The observation has changed where so many mm^2 of connected cells have.
+    pub observation_changed_area_mm2: f64,
     /// Wall seconds that a confirmation waits for its proposal and heightmap.
     pub confirmation_grace_s: f64,
     /// The driver and its wiring.
@@ -109,7 +109,7 @@ impl Default for SuctionExecutorParameters {
             urdf: PathBuf::new(),
             limits: Limits::default(),
             observation_tolerance_m: 0.005,
-            observation_changed_fraction: 0.001,
+            observation_changed_area_mm2: 75.0,
             confirmation_grace_s: 0.5,
             driver: Driver::default(),
         }
@@ -191,7 +191,7 @@ impl Parameters for SuctionExecutorParameters {
         ("limits.descend_m_s", Range::POSITIVE),
         ("limits.acceleration_m_s2", Range::POSITIVE),
         ("observation_tolerance_m", Range::POSITIVE),
-        ("observation_changed_fraction", Range::SHARE),
+        ("observation_changed_area_mm2", Range::POSITIVE),
         ("sure_probability", Range::SHARE),
         ("presence_timeout_s", Range::POSITIVE),
         ("confirmation_grace_s", TIME),
@@ -217,7 +217,7 @@ impl Parameters for SuctionExecutorParameters {
         "limits.descend_m_s",
         "limits.acceleration_m_s2",
         "observation_tolerance_m",
-        "observation_changed_fraction",
+        "observation_changed_area_mm2",
         "confirmation_grace_s",
     ];
 }
@@ -244,8 +244,8 @@ mod tests {
         for (line, name) in [
             ("limits: {carry_m_s: 0.0}", "limits.carry_m_s"),
             (
-                "observation_changed_fraction: 1.5",
-                "observation_changed_fraction",
+                "observation_changed_area_mm2: -1.0",
+                "observation_changed_area_mm2",
             ),
             ("driver: {vacuum_pin: 40}", "driver.vacuum_pin"),
             (

@@ -3,7 +3,7 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use heightmap::{Heightmap, Workspace};
+use heightmap::{ChangeRules, Heightmap, Workspace};
 use nalgebra::{Isometry2, Vector2};
 use pick_place::{PickPlace, PrimitiveSettings};
 
@@ -26,8 +26,7 @@ fn rules() -> GateRules {
             descend_m_s: 0.2,
             acceleration_m_s2: 5.0,
         },
-        observation_tolerance_m: 0.005,
-        observation_changed_fraction: 0.001,
+        changes: ChangeRules::default(),
         confirmation_grace: GRACE,
         require_approval: RequireApproval::Always,
     }
@@ -85,12 +84,13 @@ const READY: Robot = Robot {
 };
 
 fn empty() -> Arc<Heightmap> {
-    Arc::new(Heightmap::new(Workspace::RAVENS))
+    raised(0)
 }
 
 /// The empty table with the first cells raised.
 fn raised(cells: usize) -> Arc<Heightmap> {
     let mut heightmap = Heightmap::new(Workspace::RAVENS);
+    heightmap.rgb.fill(100);
     heightmap.height_m[..cells].fill(0.02);
     Arc::new(heightmap)
 }
@@ -437,7 +437,7 @@ fn an_approval_after_the_observation_changed_moves_nothing() {
     let actions = approve(&mut gate, 7);
     assert_refused(&gate, actions, &["7", "observation has changed", "6.000 s"]);
     // A small change is noise.
-    gate.on_heightmap(Duration::from_secs(7), raised(20));
+    gate.on_heightmap(Duration::from_secs(7), raised(8));
     assert!(matches!(approve(&mut gate, 7)[..], [GateAction::Move(_)]));
 }
 

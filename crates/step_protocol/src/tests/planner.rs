@@ -3,7 +3,7 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use heightmap::{Disk, Heightmap, Workspace};
+use heightmap::{ChangeRules, Disk, Heightmap, Workspace};
 use nalgebra::{Isometry2, Point2, Vector2};
 use pick_place::PrimitiveSettings;
 
@@ -17,8 +17,7 @@ const REJECTED_RADIUS_M: f64 = 0.02;
 
 fn planner() -> ProposalPlanner {
     ProposalPlanner::new(PlannerRules {
-        observation_tolerance_m: 0.005,
-        observation_changed_fraction: 0.001,
+        changes: ChangeRules::default(),
         rejected_radius_m: REJECTED_RADIUS_M,
         checkpoint: "a checkpoint".into(),
         author: "a planner".into(),
@@ -31,6 +30,7 @@ fn heightmap(stamp_s: u64, height_m: f32) -> Observation {
         cols: 3,
         ..Workspace::RAVENS
     });
+    heightmap.rgb.fill(100);
     heightmap.height_m.fill(height_m);
     Observation {
         stamp: Duration::from_secs(stamp_s),

@@ -8,7 +8,7 @@ use std::fmt;
 use std::sync::Arc;
 use std::time::Duration;
 
-use heightmap::{Heightmap, Workspace};
+use heightmap::{ChangeRules, Heightmap, Workspace};
 use nalgebra::{Isometry2, Point2, Vector2};
 use pick_place::{PickPlace, PrimitiveSettings};
 use rand::{Rng, RngExt, SeedableRng};
@@ -221,8 +221,7 @@ fn tracker() -> GoalTracker {
 
 fn planner() -> ProposalPlanner {
     ProposalPlanner::new(PlannerRules {
-        observation_tolerance_m: 0.005,
-        observation_changed_fraction: 0.001,
+        changes: ChangeRules::default(),
         rejected_radius_m: 0.02,
         checkpoint: String::new(),
         author: "planner".into(),
@@ -233,8 +232,7 @@ fn gate() -> ApprovalGate {
     ApprovalGate::new(GateRules {
         frame: "world".into(),
         limits: PrimitiveSettings::RIGID,
-        observation_tolerance_m: 0.005,
-        observation_changed_fraction: 0.001,
+        changes: ChangeRules::default(),
         confirmation_grace: GRACE,
         require_approval: RequireApproval::Always,
     })
@@ -242,6 +240,7 @@ fn gate() -> ApprovalGate {
 
 fn heightmap(height_m: f32) -> Arc<Heightmap> {
     let mut heightmap = Heightmap::new(WORKSPACE);
+    heightmap.rgb.fill(100);
     heightmap.height_m.fill(height_m);
     Arc::new(heightmap)
 }

@@ -12,7 +12,7 @@ use crate::{
     Proposed, RequireApproval, RobotState, StepOutcome,
 };
 
-const NOW: Duration = Duration::from_secs(100);
+pub(super) const NOW: Duration = Duration::from_secs(100);
 const GRACE: Duration = Duration::from_secs(1);
 
 fn rules() -> GateRules {
@@ -32,7 +32,7 @@ fn rules() -> GateRules {
     }
 }
 
-fn proposal(id: u64) -> Proposal {
+pub(super) fn proposal(id: u64) -> Proposal {
     Proposal {
         id: ProposalId(id),
         frame: "world".into(),
@@ -63,7 +63,7 @@ fn proposal(id: u64) -> Proposal {
 
 /// A robot that can do everything, or says why not.
 #[derive(Default)]
-struct Robot {
+pub(super) struct Robot {
     obstacle: Option<&'static str>,
     no_plan: Option<&'static str>,
 }
@@ -78,7 +78,7 @@ impl RobotState for Robot {
     }
 }
 
-const READY: Robot = Robot {
+pub(super) const READY: Robot = Robot {
     obstacle: None,
     no_plan: None,
 };
@@ -96,14 +96,14 @@ fn raised(cells: usize) -> Arc<Heightmap> {
 }
 
 /// A gate that has received a heightmap and proposal 7, made from it.
-fn gate() -> ApprovalGate {
+pub(super) fn gate() -> ApprovalGate {
     let mut gate = ApprovalGate::new(rules());
     gate.on_heightmap(Duration::from_secs(5), empty());
     assert_eq!(propose(&mut gate, proposal(7)), Proposed::Pending);
     gate
 }
 
-fn propose(gate: &mut ApprovalGate, proposal: Proposal) -> Proposed {
+pub(super) fn propose(gate: &mut ApprovalGate, proposal: Proposal) -> Proposed {
     gate.on_proposal(proposal.id, Ok(proposal))
 }
 

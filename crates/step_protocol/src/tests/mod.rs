@@ -1,3 +1,4 @@
+mod diagram;
 mod gate;
 mod operator;
 mod planner;

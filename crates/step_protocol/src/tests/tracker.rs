@@ -15,7 +15,7 @@ use crate::{
     StepResult,
 };
 
-fn tracker(count: u32) -> GoalTracker {
+pub(super) fn tracker(count: u32) -> GoalTracker {
     judged_by(count, StepJudge::Operator)
 }
 
@@ -55,7 +55,7 @@ fn judged_by(count: u32, judge: StepJudge) -> GoalTracker {
     GoalTracker::new(sequence, judge)
 }
 
-fn proposal(id: u64, step: u32, attempt: u32) -> Proposal {
+pub(super) fn proposal(id: u64, step: u32, attempt: u32) -> Proposal {
     Proposal {
         id: ProposalId(id),
         frame: "world".into(),
@@ -77,7 +77,7 @@ fn proposal(id: u64, step: u32, attempt: u32) -> Proposal {
     }
 }
 
-fn result(id: u64, outcome: StepOutcome, sec: u64) -> StepResult {
+pub(super) fn result(id: u64, outcome: StepOutcome, sec: u64) -> StepResult {
     StepResult {
         stamp: Duration::from_secs(sec),
         proposal_id: ProposalId(id),
@@ -95,7 +95,7 @@ fn refused(id: u64, status: ProposalStatus, sec: u64) -> StepResult {
     }
 }
 
-fn says(decision: OperatorDecision, proposal_id: u64) -> Confirmation {
+pub(super) fn says(decision: OperatorDecision, proposal_id: u64) -> Confirmation {
     Confirmation {
         stamp: Duration::ZERO,
         proposal_id: ProposalId(proposal_id),

@@ -202,6 +202,19 @@ def test_the_cell_is_reset_to_a_seed_once_and_time_goes_on(cell: Cell) -> None:
     assert "no_such_problem" in refused.message
 
 
+def test_a_reset_that_names_no_problem_keeps_that_of_the_reset_before(cell: Cell) -> None:
+    def heightmap_of(problem: str) -> Heightmap:
+        begun = cell.call(cell.reset, ResetCell.Request(request_id=name(), problem=problem, seed=10000))
+        assert begun.success, begun.message
+        return cell.operator.next("heightmap", 0, lambda made: nanoseconds(made.header.stamp) >= nanoseconds(begun.stamp))
+
+    placing = heightmap_of("")
+    stacking = heightmap_of("stacking")
+    assert not np.array_equal(stacking.height_m, placing.height_m)
+    assert np.array_equal(heightmap_of("").height_m, stacking.height_m)
+    assert np.array_equal(heightmap_of("placing").height_m, placing.height_m)
+
+
 @pytest.mark.parametrize("client", ["load", "capture", "set_step", "reset"])
 def test_a_request_without_an_id_is_refused(cell: Cell, client: str) -> None:
     client = getattr(cell, client)

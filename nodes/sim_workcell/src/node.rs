@@ -410,6 +410,8 @@ impl Activity {
 struct Hardware {
     node: Node,
     parameters: SimWorkcellParameters,
+    /// Of the present episode; a reset may have begun another one than the parameter's.
+    problem: String,
     workcell: Workcell,
     work_cell: WorkCell,
     commands: mpsc::Receiver<Command>,
@@ -573,6 +575,7 @@ impl Hardware {
             reward: node.publisher("reward", Qos::Event)?,
             node: node.clone(),
             said_pins: workcell.io_states(),
+            problem: parameters.problem.clone(),
             parameters,
             workcell,
             work_cell,
@@ -607,9 +610,9 @@ impl Hardware {
     fn run(&mut self) -> anyhow::Result<()> {
         // What waited while nothing was active is refused.
         while self.commands.try_recv().is_ok() {}
-        let (problem, seed) = (&self.parameters.problem, self.parameters.seed);
         info!(
-            "problem {problem}, seed {seed}: ready at {:?}",
+            "problem {}: ready at {:?}",
+            self.problem,
             self.workcell.time()
         );
         self.origin = (Instant::now(), self.workcell.time());
@@ -776,10 +779,9 @@ impl Hardware {
             Ok(None) => {}
         }
         let name = match request.problem.as_str() {
-            "" => &self.parameters.problem,
-            name => name,
-        }
-        .to_owned();
+            "" => self.problem.clone(),
+            name => name.to_owned(),
+        };
         let seed = request.seed;
         let begun = Problem::load(&self.parameters.problems_dir, &name)
             .map_err(|error| error.to_string())
@@ -790,8 +792,7 @@ impl Hardware {
         let answer = match begun {
             Ok(()) => {
                 info!("reset: problem {name}, seed {seed}");
-                self.parameters.problem = name;
-                self.parameters.seed = seed;
+                self.problem = name;
                 if self.workcell.environment().rig().is_some() {
                     // The errors of the calibration are those of the seed.
                     self.tf_static.publish(fixed_transforms(

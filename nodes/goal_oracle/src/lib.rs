@@ -17,7 +17,7 @@ use msgs::{
         PrimitiveSettings, SetStep, SetStepRequest, SetStepResponse, StepConfirmation, StepResult,
     },
 };
-use node_kit::{Active, Level, Node, Once, Publisher, Qos};
+use node_kit::{Active, Level, Node, Publisher, Qos, ReplyCache};
 use step_protocol::{
     Capture, Change, ConfirmationRefusal, GoalSequence, GoalTracker, Observation, ProposalId,
     StepJudge,
@@ -67,9 +67,9 @@ pub async fn configure(node: Node, parameters: GoalOracleParameters) -> anyhow::
         tracker: GoalTracker::new(sequence, judge),
         newest: None,
         matcher,
-        loads: Once::default(),
-        captures: Once::default(),
-        steps: Once::default(),
+        loads: ReplyCache::default(),
+        captures: ReplyCache::default(),
+        steps: ReplyCache::default(),
         node,
         parameters,
     })
@@ -249,9 +249,9 @@ pub struct OracleNode {
     refusals: Publisher<ConfirmationRefused>,
     newest: Option<Newest>,
     matcher: ImageMatcher,
-    loads: Once<LoadDemonstrationResponse>,
-    captures: Once<CaptureGoalResponse>,
-    steps: Once<SetStepResponse>,
+    loads: ReplyCache<LoadDemonstrationResponse>,
+    captures: ReplyCache<CaptureGoalResponse>,
+    steps: ReplyCache<SetStepResponse>,
 }
 
 impl OracleNode {
@@ -362,10 +362,8 @@ impl OracleNode {
                 ..Default::default()
             }
         };
-        match self.loads.answered(&request.request_id) {
-            Err(invalid) => return (refusal(invalid.to_string()), Change::None),
-            Ok(Some(answer)) => return (answer, Change::None),
-            Ok(None) => {}
+        if let Some(answer) = self.loads.known(&request.request_id, refusal) {
+            return (answer, Change::None);
         }
         let reading = self
             .node
@@ -402,10 +400,8 @@ impl OracleNode {
                 ..Default::default()
             }
         };
-        match self.captures.answered(&request.request_id) {
-            Err(invalid) => return (refusal(invalid.to_string()), Change::None),
-            Ok(Some(answer)) => return (answer, Change::None),
-            Ok(None) => {}
+        if let Some(answer) = self.captures.known(&request.request_id, refusal) {
+            return (answer, Change::None);
         }
         let (answer, change) = match self.take_capture(&request) {
             Ok((stamp, step, change)) => {
@@ -467,36 +463,26 @@ impl OracleNode {
     }
 
     fn set_step(&mut self, request: &SetStepRequest) -> (SetStepResponse, Change) {
-        let known = self.steps.answered(&request.request_id);
-        if let Ok(Some(answer)) = known {
-            return (answer, Change::None);
-        }
-        let valid = known.is_ok();
-        let change = match known {
-            Ok(_) => self
-                .tracker
-                .set_step(request.step)
-                .map_err(|none| none.to_string()),
-            Err(invalid) => Err(invalid.to_string()),
-        };
-        let (step, step_count, attempt) = self.tracker.progress();
-        let answer = |success, message| SetStepResponse {
+        let answer = |(step, step_count, attempt), success, message| SetStepResponse {
             success,
             message,
             step,
             step_count,
             attempt,
         };
-        let (answer, change) = match change {
-            Ok(change) => (answer(true, String::new()), change),
-            Err(reason) => {
-                warn!("set_step: {reason}");
-                (answer(false, reason), Change::None)
-            }
+        let before = self.tracker.progress();
+        let refusal = |reason: String| {
+            warn!("set_step: {reason}");
+            answer(before, false, reason)
         };
-        if valid {
-            self.steps.remember(&request.request_id, answer.clone());
+        if let Some(answer) = self.steps.known(&request.request_id, refusal) {
+            return (answer, Change::None);
         }
+        let (answer, change) = match self.tracker.set_step(request.step) {
+            Ok(change) => (answer(self.tracker.progress(), true, String::new()), change),
+            Err(none) => (refusal(none.to_string()), Change::None),
+        };
+        self.steps.remember(&request.request_id, answer.clone());
         (answer, change)
     }
 }

@@ -33,7 +33,7 @@ use msgs::ur_msgs::{
 };
 use multiravens::render::RgbdImage;
 use multiravens::{MotionEnd, Problem};
-use node_kit::{Active, Level, NewGoal, Node, Once, Publisher, Qos, RunningGoal};
+use node_kit::{Active, Level, NewGoal, Node, Publisher, Qos, ReplyCache, RunningGoal};
 use tokio::sync::oneshot;
 use tracing::{error, info, warn};
 use ur5::{JointTrajectory, Joints, WorkCell};
@@ -450,7 +450,7 @@ struct Hardware {
     next_set: usize,
     /// Sets taken of noisy cameras so far.
     sets_taken: u64,
-    resets: Once<ResetCellResponse>,
+    resets: ReplyCache<ResetCellResponse>,
     said_pins: IOStates,
     /// When the last command ended.
     last_command: Instant,
@@ -597,7 +597,7 @@ impl Hardware {
             frames: Vec::new(),
             next_set: 0,
             sets_taken: 0,
-            resets: Once::default(),
+            resets: ReplyCache::default(),
             last_command: Instant::now(),
             next_status: Instant::now(),
             next_pins: Instant::now(),
@@ -745,11 +745,12 @@ impl Hardware {
             Command::Die => return Some(command),
             Command::SetIo(request, reply) => self.set_io(&request, reply),
             Command::Reset(request, reply) => {
-                let known = self.resets.answered(&request.request_id);
-                let answer = known.ok().flatten().unwrap_or_else(|| ResetCellResponse {
-                    message: format!("{reason}: cancel it first"),
+                let refusal = |message| ResetCellResponse {
+                    message,
                     ..Default::default()
-                });
+                };
+                let known = self.resets.known(&request.request_id, refusal);
+                let answer = known.unwrap_or_else(|| refusal(format!("{reason}: cancel it first")));
                 let _ = reply.send(answer);
             }
         }
@@ -773,10 +774,8 @@ impl Hardware {
                 ..Default::default()
             }
         };
-        match self.resets.answered(&request.request_id) {
-            Err(invalid) => return Ok(refusal(invalid.to_string())),
-            Ok(Some(answer)) => return Ok(answer),
-            Ok(None) => {}
+        if let Some(answer) = self.resets.known(&request.request_id, refusal) {
+            return Ok(answer);
         }
         let name = match request.problem.as_str() {
             "" => self.problem.clone(),

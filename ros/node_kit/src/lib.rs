@@ -15,7 +15,6 @@ mod invalid_parameter;
 mod lifecycle;
 pub mod logging;
 mod node;
-mod once;
 mod parameter_services;
 mod parameter_store;
 mod parameters;
@@ -23,6 +22,7 @@ mod plain;
 mod qos;
 mod qos_overrides;
 mod raw;
+mod reply_cache;
 mod service;
 mod statistics;
 mod topic;
@@ -37,7 +37,6 @@ pub use image_subscription::ImageSubscription;
 pub use invalid_parameter::InvalidParameter;
 pub use lifecycle::{Active, LifecycleClient, LifecycleError, State, Transition};
 pub use node::{Node, NodeError};
-pub use once::{InvalidRequestId, Once};
 pub use parameters::{
     Loaded, NoParameters, ParameterError, Parameters, Range, load_text, mistakes_in_documentation,
 };
@@ -47,6 +46,7 @@ pub use qos_overrides::QosOverrides;
 pub use raw::{
     AsBytes, NoCdr, Offer, PublisherId, RawMessage, RawPublisher, RawQos, RawSubscription,
 };
+pub use reply_cache::ReplyCache;
 pub use service::{CallError, CallOptions, RequestId, ServiceClient, ServiceServer};
 pub use statistics::{Snapshot, Statistics};
 pub use topic::{Publisher, Subscription};

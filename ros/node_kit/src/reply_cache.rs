@@ -10,7 +10,7 @@ const MAX_ID: usize = 64;
 
 /// The answers to the last requests, by the ids that their callers chose.
 #[derive(Clone, Debug)]
-pub struct Once<R> {
+pub struct ReplyCache<R> {
     answers: VecDeque<(String, R)>,
 }
 
@@ -19,9 +19,9 @@ pub struct Once<R> {
 #[error(
     "request_id is {0:?}, expected 1 to {MAX_ID} printable ASCII characters, for instance a UUID"
 )]
-pub struct InvalidRequestId(String);
+struct InvalidRequestId(String);
 
-impl<R> Default for Once<R> {
+impl<R> Default for ReplyCache<R> {
     fn default() -> Self {
         Self {
             answers: VecDeque::new(),
@@ -29,9 +29,27 @@ impl<R> Default for Once<R> {
     }
 }
 
-impl<R: Clone> Once<R> {
-    /// What this request was answered before; nothing where it is new.
-    pub fn answered(&self, request_id: &str) -> Result<Option<R>, InvalidRequestId> {
+impl<R: Clone> ReplyCache<R> {
+    /// The answer of a request that needs no work: the earlier one where it has come before, a `refusal` that says why where its id is
+    /// not valid. Nothing where it is new.
+    ///
+    /// ```
+    /// # use node_kit::ReplyCache;
+    /// let mut replies = ReplyCache::default();
+    /// let refusal = |reason: String| Err(reason);
+    /// assert_eq!(replies.known("a1", refusal), None);
+    /// replies.remember("a1", Ok(7));
+    /// assert_eq!(replies.known("a1", refusal), Some(Ok(7)));
+    /// assert!(matches!(replies.known("", refusal), Some(Err(_))));
+    /// ```
+    pub fn known(&self, request_id: &str, refusal: impl FnOnce(String) -> R) -> Option<R> {
+        match self.answered(request_id) {
+            Ok(answer) => answer,
+            Err(invalid) => Some(refusal(invalid.to_string())),
+        }
+    }
+
+    fn answered(&self, request_id: &str) -> Result<Option<R>, InvalidRequestId> {
         let good = |byte: u8| byte.is_ascii_graphic() || byte == b' ';
         if !(1..=MAX_ID).contains(&request_id.len()) || !request_id.bytes().all(good) {
             let shown = request_id.chars().take(MAX_ID).collect();
@@ -56,23 +74,23 @@ mod tests {
 
     #[test]
     fn a_request_that_comes_again_has_the_same_answer_and_old_ones_are_forgotten() {
-        let mut once = Once::default();
-        assert_eq!(once.answered("a"), Ok(None));
-        once.remember("a", 1);
-        assert_eq!(once.answered("a"), Ok(Some(1)));
-        assert_eq!(once.answered("b"), Ok(None));
+        let mut cache = ReplyCache::default();
+        assert_eq!(cache.answered("a"), Ok(None));
+        cache.remember("a", 1);
+        assert_eq!(cache.answered("a"), Ok(Some(1)));
+        assert_eq!(cache.answered("b"), Ok(None));
         for number in 0..ANSWERS {
-            once.remember(&format!("later {number}"), 2);
+            cache.remember(&format!("later {number}"), 2);
         }
-        assert_eq!(once.answered("a"), Ok(None));
-        assert_eq!(once.answers.len(), ANSWERS);
+        assert_eq!(cache.answered("a"), Ok(None));
+        assert_eq!(cache.answers.len(), ANSWERS);
     }
 
     #[test]
     fn an_id_that_is_none_is_refused() {
-        let once = Once::<u8>::default();
+        let cache = ReplyCache::<u8>::default();
         for id in ["", "a\nb", "\u{1}", "größer", &"x".repeat(MAX_ID + 1)] {
-            let error = once.answered(id).unwrap_err().to_string();
+            let error = cache.answered(id).unwrap_err().to_string();
             assert!(error.contains("request_id"), "{error}");
         }
     }

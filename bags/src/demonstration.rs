@@ -10,7 +10,7 @@ use std::sync::Arc;
 use std::time::Duration;
 use step_protocol::{GoalSequence, NoGoals, ShownStep, goal_steps, goals_of};
 
-/// One step: what was seen, what was done, what came of it.
+/// One step: observation, action and result.
 #[derive(Clone, Debug, PartialEq)]
 pub struct DemonstrationStep {
     /// The workspace before the action.

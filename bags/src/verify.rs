@@ -208,7 +208,7 @@ fn name_of(path: &Path) -> String {
         .into_owned()
 }
 
-/// A file of a bag to be looked through, uncompressed if it was compressed as a whole; where that ends early is told.
+/// A file of a bag, uncompressed if it was compressed as a whole; a compressed stream that ends early is reported.
 fn open(path: &Path, findings: &mut Findings) -> Result<Unpacked, BagError> {
     let unpacked = unpack(path)?;
     if let Some(reason) = &unpacked.cut {
@@ -235,8 +235,7 @@ impl Channels {
     fn record(&mut self, opcode: u8, body: &[u8]) -> Result<(), String> {
         match opcode {
             op::SCHEMA => {
-                let (id, name, encoding, data) =
-                    scan::schema(body).ok_or("a schema that is none")?;
+                let (id, name, encoding, data) = scan::schema(body).ok_or("not a valid schema")?;
                 let schema = mcap::Schema {
                     id,
                     name,
@@ -251,7 +250,7 @@ impl Channels {
                 };
             }
             op::CHANNEL => {
-                let channel = scan::channel(body).ok_or("a channel that is none")?;
+                let channel = scan::channel(body).ok_or("not a valid channel")?;
                 let schema = self.schemas.get(&channel.schema_id).cloned();
                 if schema.is_none() && channel.schema_id != 0 {
                     return Err(format!(

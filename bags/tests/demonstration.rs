@@ -1,4 +1,4 @@
-//! Demonstrations: nothing is lost, and what is none says why.
+//! Demonstrations: nothing is lost, and a bag that holds none is refused with the reason.
 
 use bags::{
     BagError, BagWriter, Compression, Demonstration, DemonstrationError, DemonstrationStep, Qos,

@@ -33,7 +33,7 @@ pub struct Demos {
     #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u64).range(1..=1000))]
     starts: u64,
     /// Probability, before each step, that it is first carried out badly: gripped or set down beside. That is no step of the
-    /// demonstration, which goes on from what came of it. With --starts the demonstration that sets the order stays clean
+    /// demonstration, which goes on from the result. With --starts the demonstration that sets the order stays clean
     #[arg(long, default_value_t = 0.0, value_parser = probability)]
     disturb: f64,
     /// What the cameras do to the images, a file as those of config/perturbations; each start is a session of the cameras of its own

@@ -6,7 +6,7 @@ use anyhow::{Result, bail};
 use clap::{Args, ValueEnum};
 use learning::wilson_95;
 use multiravens::Environment;
-use multiravens::health::{Blind, Checkup, Extremes, check_up};
+use multiravens::health::{BaselinePolicy, Checkup, Extremes, check_up};
 use serde::Serialize;
 use std::collections::BTreeMap;
 
@@ -46,12 +46,12 @@ enum Policy {
 }
 
 impl Policy {
-    fn blind(self) -> Option<Blind> {
+    fn blind(self) -> Option<BaselinePolicy> {
         match self {
-            Self::Pixels => Some(Blind::Pixels),
-            Self::Bodies => Some(Blind::Bodies),
-            Self::Repeat => Some(Blind::Repeat),
-            Self::Drag => Some(Blind::Drag),
+            Self::Pixels => Some(BaselinePolicy::Pixels),
+            Self::Bodies => Some(BaselinePolicy::Bodies),
+            Self::Repeat => Some(BaselinePolicy::Repeat),
+            Self::Drag => Some(BaselinePolicy::Drag),
             Self::Demonstrator => None,
         }
     }
@@ -107,7 +107,7 @@ impl Distribution {
             p90: at(0.9),
             p99: at(0.99),
             max: at(1.0),
-            bar: value(&Extremes::BARS),
+            bar: value(&Extremes::LIMITS),
         }
     }
 }

@@ -135,7 +135,7 @@ pub enum DataSetError {
     /// An image cannot be compressed, or not be decoded again.
     #[error("an image of the data set: {0}")]
     Image(std::io::Error),
-    /// A demonstration that is none.
+    /// A bag that holds no valid demonstration.
     #[error(transparent)]
     Demonstration(#[from] DemonstrationError),
     /// A demonstration of another problem.

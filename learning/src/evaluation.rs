@@ -62,11 +62,11 @@ pub struct EpisodeReport {
     pub steps: usize,
     /// Steps before which the goal module *image distance* would have named the same goal as the oracle.
     pub image_distance_right: usize,
-    /// What a network said of each step, and what came of it; none of the baseline.
+    /// The network's judgements of each step, and the step's result; empty for the baseline.
     pub said: Vec<SaidStep>,
 }
 
-/// What a network said of one of its steps, and what came of it.
+/// A network's judgements of one step, and the step's result.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct SaidStep {
     /// What it said.
@@ -170,7 +170,7 @@ pub struct Attempt {
     pub rollout: Rollout,
     /// Steps before which the goal module *image distance* would have named the same goal as the oracle.
     pub image_distance_right: usize,
-    /// What a network said of each step, and what came of it; none of the baseline.
+    /// The network's judgements of each step, and the step's result; empty for the baseline.
     pub said: Vec<SaidStep>,
 }
 
@@ -254,7 +254,7 @@ pub fn attempt(
 }
 
 /// Evaluates on episodes. One thread for each actor given, which must all be alike; the result does not depend on how
-/// many. With a perturbation, observations and goals are what such cameras see. `progress` is told of each episode as it comes.
+/// many. With a perturbation, observations and goals are what such cameras see. `progress` is called after each episode.
 pub fn evaluate(
     problem: &Problem,
     work_cell: &WorkCell,

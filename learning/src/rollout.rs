@@ -53,7 +53,7 @@ pub fn demonstrate_in_order(
 }
 
 /// [`demonstrate_in_order`], disturbed before each step with a probability, see [`Environment::disturb`].
-/// What a disturbance does is no step: the next one begins from what came of it. A demonstration in which
+/// A disturbance is not a step: the next step begins from its result. A demonstration in which
 /// a disturbance reaches a goal is not complete, since no step shows how.
 pub fn demonstrate_disturbed(
     environment: &mut Environment,
@@ -95,7 +95,7 @@ pub fn replay(
 }
 
 /// Begins the episode of a seed and takes the actions of `act`, which is shown the observation, until
-/// the episode is over or it gives none. `after` is told each action and what it did.
+/// the episode is over or it gives none. `after` is called with each action and its result.
 pub fn roll_out<E: From<EnvironmentError>>(
     environment: &mut Environment,
     seed: impl Into<EpisodeSeed>,

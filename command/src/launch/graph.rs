@@ -10,7 +10,7 @@ use std::time::Duration;
 use tokio::process::{Child, Command};
 use tokio::task::JoinHandle;
 
-/// The nodes and what each is told beside its file in config/.
+/// The nodes, and the parameters of each beside its file in config/.
 pub struct Settings {
     pub problem: String,
     /// Folder of the problem's file.
@@ -34,7 +34,7 @@ pub struct Settings {
     pub console: Option<Console>,
 }
 
-/// What the operator's console is told.
+/// Parameters of the operator's console.
 pub struct Console {
     /// File that it writes the address of its page to.
     pub address_file: PathBuf,

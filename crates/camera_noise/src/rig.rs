@@ -123,7 +123,7 @@ impl Rig {
         self.light_turn * usual
     }
 
-    /// Boxes on the table. They may stand where objects of the task do: whoever renders leaves those out.
+    /// Boxes on the table. They may overlap objects of the task: the renderer leaves those out.
     pub fn clutter(&self) -> &[ClutterItem] {
         &self.clutter
     }

@@ -83,7 +83,7 @@ pub enum Error {
         /// Images given.
         actual: usize,
     },
-    /// The network answered with a number that is none, or training diverged.
+    /// The network's output is not finite, or training diverged.
     #[error("{what} is not finite{}", step.map(|step| format!(" at step {step}")).unwrap_or_default())]
     NotFinite {
         /// Which quantity.

@@ -128,7 +128,7 @@ fn what_is_no_embedding_is_refused_by_name() {
         let error = refused();
         assert!(error.contains("truncated"), "{error}");
     }
-    // Halves of 16 bits: the last number becomes one that is none.
+    // Halves of 16 bits: the last number becomes NaN.
     let mut nan = bytes.clone();
     let end = nan.len();
     nan[end - 2..].copy_from_slice(&[0x00, 0x7e]);

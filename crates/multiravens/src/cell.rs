@@ -1,7 +1,7 @@
 //! The simulated hardware behind the UR driver's interface: arm, suction, cameras.
 
+use crate::camera_rig::CameraRig;
 use crate::render::{RenderError, RgbdImage};
-use crate::stage::Stage;
 use crate::world::{self, World};
 use camera_noise::ClutterItem;
 use heightmap::{Camera, Intrinsics, View};
@@ -136,7 +136,7 @@ impl Rehearsal {
 ///
 /// Simulated time advances in [`Self::tick`] and [`Self::settle`] only. A motion that ends with
 /// the arm at home and nothing held is reported as ended when all bodies have come to rest, so
-/// that whoever drives the cell, tick by tick or through [`Robot`], sees the same times and states.
+/// that both ways to drive the cell, tick by tick and through [`Robot`], give the same times and states.
 pub struct Cell {
     work_cell: WorkCell,
     world: World,
@@ -144,7 +144,7 @@ pub struct Cell {
     motion: Option<Motion>,
     suction: bool,
     settled: bool,
-    stage: Stage,
+    camera_rig: CameraRig,
 }
 
 impl Cell {
@@ -159,7 +159,7 @@ impl Cell {
         let joints = work_cell.arm.home;
         Self {
             world: World::new(&work_cell.arm.tip(&joints)),
-            stage: Stage::new(cameras.collect()),
+            camera_rig: CameraRig::new(cameras.collect()),
             work_cell: work_cell.clone(),
             joints,
             motion: None,
@@ -364,7 +364,7 @@ impl Cell {
             motion: None,
             suction: self.suction,
             settled: self.settled,
-            stage: Stage::new(Vec::new()),
+            camera_rig: CameraRig::new(Vec::new()),
         };
         let arm = &self.work_cell.arm;
         let outcome = pick_place::execute(&mut copy, arm, action, settings, |_| ())?;
@@ -388,23 +388,23 @@ impl Cell {
 
     /// Lights the scene from another side and adds boxes that are seen and that nothing touches, until this is called again.
     pub fn perturb(&mut self, light: Vector3<f64>, clutter: Vec<ClutterItem>) {
-        self.stage.perturb(light, clutter);
+        self.camera_rig.perturb(light, clutter);
     }
 
     /// What the cameras see now.
     pub fn render(&mut self) -> Result<&[RgbdImage], RenderError> {
-        self.stage
+        self.camera_rig
             .render(&self.work_cell, &self.joints, &self.world)
     }
 
     /// The images of the last [`Self::render`] with their cameras.
     pub fn views(&self) -> impl Iterator<Item = View<'_>> {
-        self.stage.views()
+        self.camera_rig.views()
     }
 
     /// The cameras, in the order of [`Self::render`].
     pub fn cameras(&self) -> &[Camera] {
-        self.stage.cameras()
+        self.camera_rig.cameras()
     }
 
     fn step(&mut self) -> Result<(), CellError> {

@@ -38,8 +38,8 @@ pub struct Environment {
     demonstrator: ChaCha8Rng,
     disturber: ChaCha8Rng,
     /// What the demonstrator's last action does in the present state, if it has rehearsed it.
-    foretold: Option<(PickPlace, Rehearsal)>,
-    /// The order in which the demonstrator reaches the goals, if it is told one.
+    cached_rehearsal: Option<(PickPlace, Rehearsal)>,
+    /// The order in which the demonstrator has to reach the goals, if one was set.
     order: Vec<usize>,
     seed: EpisodeSeed,
     steps: usize,
@@ -202,7 +202,7 @@ impl Environment {
             tasks: Vec::new(),
             demonstrator: stream(0, DEMONSTRATOR_STREAM),
             disturber: stream(0, DISTURBANCE_STREAM),
-            foretold: None,
+            cached_rehearsal: None,
             order: Vec::new(),
             seed: 0.into(),
             steps: 0,
@@ -281,7 +281,7 @@ impl Environment {
         self.steps = 0;
         self.tasks.clear();
         self.cell.clear();
-        self.foretold = None;
+        self.cached_rehearsal = None;
         self.demonstrator = stream(seed.start, DEMONSTRATOR_STREAM);
         self.disturber = stream(seed.start, DISTURBANCE_STREAM);
         for (index, placement) in self.problem.modules().iter().enumerate() {
@@ -355,7 +355,7 @@ impl Environment {
             progress
                 .task
                 .demonstrate(&self.cell, &mut self.demonstrator, next)?;
-        self.foretold = rehearsal.map(|rehearsal| (action, rehearsal));
+        self.cached_rehearsal = rehearsal.map(|rehearsal| (action, rehearsal));
         Some(action)
     }
 
@@ -369,7 +369,7 @@ impl Environment {
         let (Some(settings), Some(mut action)) = (self.settings(), self.demonstrate()) else {
             return Ok(false);
         };
-        self.foretold = None;
+        self.cached_rehearsal = None;
         let grips_beside = self.disturber.random_bool(0.5);
         let mut off = || self.disturber.random_range(-1.0..1.0);
         let beside = Vector2::new(off(), off());
@@ -394,8 +394,8 @@ impl Environment {
     /// Carries out an action with the settings of the module being solved, and assesses it. What the
     /// demonstrator has just rehearsed is not simulated again.
     pub fn step(&mut self, action: &PickPlace) -> Result<StepReport, EnvironmentError> {
-        match self.foretold.take() {
-            Some((foretold, rehearsal)) if foretold == *action => {
+        match self.cached_rehearsal.take() {
+            Some((cached_rehearsal, rehearsal)) if cached_rehearsal == *action => {
                 self.step_by(action, |cell, _| Ok(cell.adopt(rehearsal)))
             }
             _ => self.step_watched(action, |_| ()),
@@ -408,7 +408,7 @@ impl Environment {
         action: &PickPlace,
         mut watch: impl FnMut(&Cell),
     ) -> Result<StepReport, EnvironmentError> {
-        self.foretold = None;
+        self.cached_rehearsal = None;
         self.step_by(action, |cell, settings| {
             let arm = cell.work_cell().arm.clone();
             let watch = |cell: &mut Cell| {
@@ -543,7 +543,7 @@ impl Environment {
 
     /// The simulated hardware, for a node that drives it.
     pub fn cell_mut(&mut self) -> &mut Cell {
-        self.foretold = None;
+        self.cached_rehearsal = None;
         &mut self.cell
     }
 

@@ -29,7 +29,7 @@ pub struct Extremes {
 
 impl Extremes {
     /// What a healthy world never exceeds: joints of 2 mm, half a bead's radius, 2 m/s.
-    pub const BARS: Self = Self {
+    pub const LIMITS: Self = Self {
         joint_error_m: 2e-3,
         depth_in_peg_m: 3e-3,
         depth_in_table_m: 3e-3,
@@ -89,7 +89,7 @@ fn depth_in_peg_m(world: &World, ball: BodyId, radius_m: f64, peg: BodyId) -> f6
 
 /// A policy that knows nothing, or hardly anything, of the task.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
-pub enum Blind {
+pub enum BaselinePolicy {
     /// Picks and places at random pixels, with a random turn.
     Pixels,
     /// Picks a random body somewhere, and places it at a random pixel.
@@ -100,7 +100,7 @@ pub enum Blind {
     Drag,
 }
 
-impl Blind {
+impl BaselinePolicy {
     fn act(self, environment: &Environment, rng: &mut ChaCha8Rng) -> Option<PickPlace> {
         let world = environment.cell().world();
         match self {
@@ -173,7 +173,7 @@ pub struct Checkup {
 pub fn check_up(
     environment: &mut Environment,
     seed: u64,
-    policy: Option<Blind>,
+    policy: Option<BaselinePolicy>,
 ) -> Result<Checkup, EnvironmentError> {
     environment.reset(seed)?;
     let mut rng = ChaCha8Rng::seed_from_u64(seed);
@@ -190,7 +190,7 @@ pub fn check_up(
             break;
         }
         let action = match policy {
-            Some(Blind::Repeat) => {
+            Some(BaselinePolicy::Repeat) => {
                 repeated = repeated.or_else(|| environment.demonstrate());
                 repeated
             }

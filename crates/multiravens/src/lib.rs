@@ -1,5 +1,6 @@
 //! MultiRavens on Rapier: simulated work cell, rendering, task modules, problems, demonstrators.
 
+mod camera_rig;
 mod cell;
 mod colors;
 mod environment;
@@ -7,7 +8,6 @@ pub mod health;
 mod problem;
 pub mod render;
 mod seed;
-mod stage;
 pub mod tasks;
 pub mod world;
 

@@ -33,7 +33,7 @@ pub enum ExecuteError<E> {
     Robot { phase: Phase, error: E },
 }
 
-/// Carries out one pick and place; `observe` is told each phase as it begins.
+/// Carries out one pick and place; `observe` is called with each phase as it begins.
 ///
 /// # Errors
 /// Returns at once, without another command to the robot.

@@ -24,7 +24,7 @@ pub struct Transforms {
 /// A transform that cannot be used.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum TransformError {
-    /// A pose that is none.
+    /// A pose that is not valid.
     #[error("transform of {child:?}: {source}")]
     Convert {
         /// The child frame.

@@ -1,11 +1,11 @@
 //! Node that fuses camera views into heightmaps.
 //!
-//! What belongs together and what is wrong with it is decided in [`Views`], which knows no ROS node.
+//! What belongs together and what is wrong with it is decided in [`FrameSynchronizer`], which knows no ROS node.
 
 mod extrinsics;
+mod frame_synchronizer;
 mod outputs;
 mod parameters;
-mod views;
 
 use std::{
     collections::{BTreeMap, VecDeque},
@@ -29,8 +29,8 @@ use tracing::{info, warn};
 use outputs::Outputs;
 
 pub use extrinsics::{CalibrationError, TransformError, Transforms, Unconnected, read_calibration};
+pub use frame_synchronizer::{FrameSynchronizer, Fused, InputError, Stream, Used};
 pub use parameters::{CameraFusionParameters, WorkspaceParameters};
-pub use views::{Complaint, Fused, Stream, Used, Views};
 
 /// Messages between their subscriptions and the fusion.
 const WAITING_ARRIVALS: usize = 32;
@@ -46,7 +46,7 @@ enum Arrival {
     Info(usize, Stream, Box<CameraInfo>),
 }
 
-/// Reads the calibration; what it returns fuses.
+/// Reads the calibration and returns the node that fuses.
 pub async fn configure(
     node: Node,
     parameters: CameraFusionParameters,
@@ -66,7 +66,7 @@ impl Active for FusionNode {
     async fn run(&mut self, node: &Node) -> anyhow::Result<()> {
         let mut changes = node.parameters::<CameraFusionParameters>();
         self.take_over(changes.borrow_and_update().clone());
-        self.views = Views::new(&self.parameters, self.poses.clone());
+        self.synchronizer = FrameSynchronizer::new(&self.parameters, self.poses.clone());
         self.cameras.clear();
         self.active_since = Instant::now();
         let mut transforms = node.subscription::<TFMessage>("/tf_static", Qos::Latched)?;
@@ -83,7 +83,7 @@ impl Active for FusionNode {
                     None => return Ok(()),
                 },
                 message = transforms.recv() => {
-                    for reason in self.views.transform(message) {
+                    for reason in self.synchronizer.transform(message) {
                         transforms.reject(reason);
                     }
                     self.fuse();
@@ -99,7 +99,7 @@ impl Active for FusionNode {
 pub struct FusionNode {
     parameters: CameraFusionParameters,
     poses: BTreeMap<String, nalgebra::Isometry3<f64>>,
-    views: Views,
+    synchronizer: FrameSynchronizer,
     cameras: Vec<CameraTopics>,
     timeout: Duration,
     active_since: Instant,
@@ -177,7 +177,7 @@ impl FusionNode {
         poses: BTreeMap<String, nalgebra::Isometry3<f64>>,
     ) -> Result<Self, NodeError> {
         Ok(Self {
-            views: Views::new(&parameters, poses.clone()),
+            synchronizer: FrameSynchronizer::new(&parameters, poses.clone()),
             cameras: Vec::new(),
             timeout: Duration::from_secs_f64(parameters.camera_timeout_s),
             active_since: Instant::now(),
@@ -196,7 +196,7 @@ impl FusionNode {
     /// Those that may be set at run time.
     fn take_over(&mut self, parameters: CameraFusionParameters) {
         self.timeout = Duration::from_secs_f64(parameters.camera_timeout_s);
-        self.views.set_tolerance_s(parameters.tolerance_s);
+        self.synchronizer.set_tolerance_s(parameters.tolerance_s);
         self.parameters = parameters;
     }
 
@@ -262,7 +262,7 @@ impl FusionNode {
     fn arrived(&mut self, arrival: Arrival) {
         let taken = match arrival {
             Arrival::Info(camera, stream, info) => {
-                let taken = self.views.calibrate(camera, stream, &info);
+                let taken = self.synchronizer.calibrate(camera, stream, &info);
                 taken.map(|()| false)
             }
             Arrival::Image(camera, stream, image) => {
@@ -288,7 +288,7 @@ impl FusionNode {
                         self.parameters.clock_skew_limit_s
                     );
                 }
-                self.views.image(camera, stream, image)
+                self.synchronizer.image(camera, stream, image)
             }
         };
         match taken {
@@ -298,22 +298,22 @@ impl FusionNode {
                 }
                 self.fuse();
             }
-            Err(complaint) => self.complain(&complaint),
+            Err(error) => self.complain(&error),
         }
     }
 
     fn fuse(&mut self) {
         let start = Instant::now();
-        let (fused, complaints) = self.views.fuse();
-        if fused.is_some() || !complaints.is_empty() {
+        let (fused, errors) = self.synchronizer.fuse();
+        if fused.is_some() || !errors.is_empty() {
             for (index, camera) in self.cameras.iter_mut().enumerate() {
-                let mut complaints = complaints.iter();
-                if !complaints.any(|bad| bad.camera == index && bad.pending) {
+                let mut errors = errors.iter();
+                if !errors.any(|bad| bad.camera == index && bad.pending) {
                     camera.pending = None;
                 }
             }
         }
-        complaints.iter().for_each(|bad| self.complain(bad));
+        errors.iter().for_each(|bad| self.complain(bad));
         if let Some(fused) = fused {
             self.publish(fused, start);
         }
@@ -321,7 +321,9 @@ impl FusionNode {
 
     /// A camera that has fallen silent may have been all that was waited for.
     fn fuse_what_is_left(&mut self) {
-        if self.views.fuses_without_silent() && self.cameras.iter().any(|camera| camera.silent) {
+        if self.synchronizer.fuses_without_silent()
+            && self.cameras.iter().any(|camera| camera.silent)
+        {
             self.fuse();
         }
     }
@@ -342,16 +344,16 @@ impl FusionNode {
         self.outputs.take(heightmap, header);
     }
 
-    fn complain(&mut self, complaint: &Complaint) {
-        let topics = &mut self.cameras[complaint.camera];
-        let statistics = match complaint.stream {
+    fn complain(&mut self, error: &InputError) {
+        let topics = &mut self.cameras[error.camera];
+        let statistics = match error.stream {
             Stream::Color => &topics.color,
             Stream::Depth => &topics.depth,
             Stream::Info => &topics.info,
             Stream::DepthInfo => &topics.depth_info,
         };
-        if !complaint.pending {
-            statistics.reject(&complaint.reason);
+        if !error.pending {
+            statistics.reject(&error.reason);
             return;
         }
         let pending = topics.pending.get_or_insert_with(|| Pending {
@@ -359,8 +361,8 @@ impl FusionNode {
             reason: String::new(),
             told: false,
         });
-        if pending.reason != complaint.reason {
-            pending.reason.clone_from(&complaint.reason);
+        if pending.reason != error.reason {
+            pending.reason.clone_from(&error.reason);
             pending.told = false;
         }
         if !pending.told && pending.since.elapsed() >= START_PATIENCE {
@@ -368,7 +370,7 @@ impl FusionNode {
             warn!(
                 "{}: {}; waited for it for {START_PATIENCE:?}, images of camera {} are not used",
                 statistics.name(),
-                complaint.reason,
+                error.reason,
                 topics.name
             );
         }
@@ -397,7 +399,7 @@ impl FusionNode {
             .collect();
             let silent = any && !missing.is_empty();
             if silent && !camera.silent {
-                let then = if self.views.fuses_without_silent() {
+                let then = if self.synchronizer.fuses_without_silent() {
                     "heightmaps are made without it"
                 } else {
                     "no heightmap without it"
@@ -411,7 +413,7 @@ impl FusionNode {
                 info!("camera {}: images arrive again", camera.name);
             }
             camera.silent = silent || (camera.silent && !missing.is_empty());
-            self.views.set_silent(index, camera.silent);
+            self.synchronizer.set_silent(index, camera.silent);
             let arrive = recent(camera.color_arrival) && recent(camera.depth_arrival);
             let (level, message) = match (missing.is_empty(), any) {
                 (true, _) if camera.pending.is_some() => {

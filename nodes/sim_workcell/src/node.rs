@@ -58,7 +58,7 @@ const ATTENTIVE: Duration = Duration::from_secs(1);
 /// By so much less often.
 const INATTENTIVE_FACTOR: f64 = 5.0;
 
-/// Sets the episode up; what it returns poses as the hardware.
+/// Begins the episode and returns the node that emulates the UR driver and the cameras.
 pub async fn configure(
     node: Node,
     parameters: SimWorkcellParameters,

@@ -35,7 +35,7 @@ use msgs::Action;
 use crate::{
     clock::Clock,
     graph::Graph,
-    service::{CallError, CallOptions, HEARING, attempt},
+    service::{CLIENT_DISCOVERY_TIMEOUT, CallError, CallOptions, attempt},
     statistics::Statistics,
 };
 
@@ -165,7 +165,7 @@ impl<A: Action + 'static> ActionServer<A> {
         loop {
             if let Some((goal, since)) = &self.waiting {
                 let topic = format!("rt{}/_action/feedback", self.shared.statistics.name);
-                let limit = HEARING.saturating_sub(since.elapsed());
+                let limit = CLIENT_DISCOVERY_TIMEOUT.saturating_sub(since.elapsed());
                 self.graph
                     .wait_for_feedback_to(goal.client, &topic, limit)
                     .await;

@@ -335,7 +335,7 @@ impl Lifecycle {
         Ok(lifecycle)
     }
 
-    /// Lives until the node is told to end, or fails.
+    /// Runs until the node is asked to end, or fails.
     pub(crate) async fn live<P, A, F>(
         mut self,
         configure: impl Fn(Node, P) -> F + Send,
@@ -501,7 +501,7 @@ impl Lifecycle {
         Ok(None)
     }
 
-    /// The next request that fits the present state; nothing when the node is told to end.
+    /// The next request that fits the present state; `None` when the node is asked to end.
     async fn request(&mut self) -> Option<Request> {
         if let Some(transition) = self.autostart.pop_front() {
             let answer = None;
@@ -523,7 +523,7 @@ impl Lifecycle {
         }
     }
 
-    /// Ends a shutdown that was asked for, and stays for whoever asks for the state.
+    /// Ends a requested shutdown, and goes on answering requests for the state.
     async fn finalized(&mut self, request: Request) -> anyhow::Result<()> {
         self.end(End::Success);
         request.answer(true);
@@ -626,7 +626,7 @@ impl LifecycleClient {
         Ok(())
     }
 
-    /// Where the node is; nothing where it says a number that is none.
+    /// The node's state; `None` where its number stands for no state.
     pub async fn state(&self) -> Result<Option<State>, LifecycleError> {
         let request = GetStateRequest::default();
         let response = self

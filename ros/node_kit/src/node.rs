@@ -101,11 +101,11 @@ impl Scope {
     }
 }
 
-/// How often a conflict is looked at, once every [`diagnostics::PERIOD`], before it is told without the other node's name, which comes
+/// Polls, one every [`diagnostics::PERIOD`], before a conflict is reported without the other node's name, which comes
 /// later than its endpoints: where its sample was lost, with the writer's next heartbeat (3 s in Fast DDS).
-const LOOKS_FOR_A_NAME: u64 = 8;
+const POLLS_FOR_A_NAME: u64 = 8;
 
-/// How long a conflict has been there, and whether it has been told.
+/// How long a conflict has been there, and whether it has been reported.
 #[derive(Clone, Copy, Debug, Default)]
 struct Sighting {
     looks: u64,
@@ -118,7 +118,7 @@ impl Sighting {
         let looks = self.looks + 1;
         Self {
             looks,
-            told: self.told || looks > LOOKS_FOR_A_NAME || named && looks > 1,
+            told: self.told || looks > POLLS_FOR_A_NAME || named && looks > 1,
         }
     }
 }
@@ -301,7 +301,7 @@ impl Node {
     }
 
     /// Waits until what this handle belongs to is over: in a node's [`run`](crate::Active::run) until the node is
-    /// deactivated or told to end. Whoever waits for it gets two seconds to tidy up; whoever does not is dropped
+    /// deactivated or asked to end. Work that waits for it has two seconds to clean up; other work is dropped
     /// where it stands.
     pub async fn deactivated(&self) {
         self.scope.observed.store(true, Ordering::Relaxed);
@@ -753,7 +753,7 @@ impl Node {
 mod tests {
     use super::*;
 
-    /// The looks after which a conflict is told, when the other node's name is known from that one on.
+    /// Polls until a conflict is reported, when the other node's name is known from that poll on.
     fn told_after(named_from: u64) -> Vec<u64> {
         let mut sighting = Sighting::default();
         let mut told = Vec::new();
@@ -771,6 +771,6 @@ mod tests {
     fn a_conflict_waits_for_the_other_nodes_name_and_is_told_once_in_any_case() {
         assert_eq!(told_after(1), [2]);
         assert_eq!(told_after(5), [5]);
-        assert_eq!(told_after(100), [LOOKS_FOR_A_NAME + 1]);
+        assert_eq!(told_after(100), [POLLS_FOR_A_NAME + 1]);
     }
 }

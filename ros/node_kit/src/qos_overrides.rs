@@ -94,9 +94,9 @@ impl QosOverrides {
         let latched = qos == Qos::Latched;
         if wish.transient_local.is_some_and(|wanted| wanted != latched) {
             let reason = match latched {
-                true => "must stay transient_local: who comes later needs the last message",
+                true => "must stay transient_local: late subscribers need the last message",
                 false => {
-                    "must stay volatile: a message of this topic must not be replayed to who comes later"
+                    "must stay volatile: a message of this topic must not be replayed to late subscribers"
                 }
             };
             return refuse("durability", reason.to_owned());

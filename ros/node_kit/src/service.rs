@@ -161,7 +161,7 @@ impl<S: Service> ServiceClient<S> {
 }
 
 /// How long a request waits for its client to be able to hear the answer.
-pub(crate) const HEARING: Duration = Duration::from_millis(500);
+pub(crate) const CLIENT_DISCOVERY_TIMEOUT: Duration = Duration::from_millis(500);
 /// Clients that are remembered as able to.
 const MAX_CLIENTS: usize = 1024;
 
@@ -226,7 +226,7 @@ impl<S: Service> ServiceServer<S> {
             return;
         }
         let topic = format!("rr{}Reply", self.statistics.name);
-        let limit = HEARING.saturating_sub(since.elapsed());
+        let limit = CLIENT_DISCOVERY_TIMEOUT.saturating_sub(since.elapsed());
         if self.graph.wait_for_answers_to(client, &topic, limit).await {
             if self.hearing.len() == MAX_CLIENTS {
                 self.hearing.clear();

@@ -152,7 +152,7 @@ const NOISE_M: f64 = 1e-3;
 /// one reaches exactly one goal more, the `next` one if there is one, with noise and again with other
 /// noise. If none does, the best.
 ///
-/// `guess` is told how many it has made before, and gives none when it has run out; `reached` says which goals are reached in a
+/// `guess` receives the number of earlier guesses and returns `None` when there are no more; `reached` says which goals are reached in a
 /// world, before the move and after a rehearsal.
 fn rehearsed(
     cell: &Cell,

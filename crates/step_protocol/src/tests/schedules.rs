@@ -492,7 +492,7 @@ impl World {
                         }
                     }
                     (None, Change::Goal(_)) => {
-                        return violation("a goal came from a decision that is none on a motion");
+                        return violation("a goal came from a decision that is not about a motion");
                     }
                     _ => {}
                 }

@@ -41,7 +41,7 @@ pub enum Stream {
 
 /// Why something that arrived cannot be used.
 #[derive(Clone, Debug, PartialEq)]
-pub struct Complaint {
+pub struct InputError {
     /// Index of the camera.
     pub camera: usize,
     /// Its stream.
@@ -53,7 +53,7 @@ pub struct Complaint {
     pub pending: bool,
 }
 
-impl Complaint {
+impl InputError {
     fn new(camera: usize, stream: Stream, reason: impl ToString) -> Self {
         Self {
             camera,
@@ -101,7 +101,7 @@ struct CameraState {
 /// holds; of several images of a stream the nearest is taken. A set is fused once: it must be newer than
 /// the last one. One that cannot be used, such as of a frame without a transform, holds up no older one.
 /// A silent camera is waited for, unless `fuse_without_silent`.
-pub struct Views {
+pub struct FrameSynchronizer {
     cameras: Vec<CameraState>,
     transforms: Transforms,
     world_frame: String,
@@ -136,7 +136,7 @@ pub struct Fused {
     pub used: Vec<Option<Used>>,
 }
 
-impl Views {
+impl FrameSynchronizer {
     /// How far from the reference stamp images may be, from the next fusion on.
     pub fn set_tolerance_s(&mut self, tolerance_s: f64) {
         self.tolerance = Duration::from_secs_f64(tolerance_s);
@@ -200,7 +200,7 @@ impl Views {
         camera: usize,
         stream: Stream,
         message: &CameraInfo,
-    ) -> Result<(), Complaint> {
+    ) -> Result<(), InputError> {
         let read = convert::intrinsics_from_msg(message).map_err(|error| error.to_string());
         let state = &mut self.cameras[camera];
         let known = match stream {
@@ -209,7 +209,7 @@ impl Views {
         };
         let result = match &read {
             Ok(_) => Ok(()),
-            Err(reason) => Err(Complaint::new(camera, stream, reason)),
+            Err(reason) => Err(InputError::new(camera, stream, reason)),
         };
         *known = Some(read);
         result
@@ -221,9 +221,9 @@ impl Views {
         camera: usize,
         stream: Stream,
         image: Image,
-    ) -> Result<bool, Complaint> {
+    ) -> Result<bool, InputError> {
         let stamp = convert::time_from_msg(&image.header.stamp)
-            .map_err(|error| Complaint::new(camera, stream, format!("header.{error}")))?;
+            .map_err(|error| InputError::new(camera, stream, format!("header.{error}")))?;
         let set_back = self.last.is_some_and(|last| stamp + CLOCK_SET_BACK < last);
         if set_back {
             self.last = None;
@@ -253,7 +253,7 @@ impl Views {
     }
 
     /// Fuses the newest new set that can be used, if there is one; and what is wrong with still newer ones.
-    pub fn fuse(&mut self) -> (Option<Fused>, Vec<Complaint>) {
+    pub fn fuse(&mut self) -> (Option<Fused>, Vec<InputError>) {
         let mut complaints = Vec::new();
         let mut before = Duration::MAX;
         while let Some(reference) = self.newest_reference(before) {
@@ -271,7 +271,7 @@ impl Views {
     }
 
     /// None where more frames of the still scene are needed.
-    fn fuse_at(&mut self, reference: Duration) -> Result<Option<Fused>, Vec<Complaint>> {
+    fn fuse_at(&mut self, reference: Duration) -> Result<Option<Fused>, Vec<InputError>> {
         let (mut cameras, mut complaints) = (Vec::new(), Vec::new());
         let without = self.fuse_without_silent;
         for (index, state) in self.cameras.iter_mut().enumerate() {
@@ -305,7 +305,7 @@ impl Views {
                 })
             })
             .collect();
-        let general = |reason: String| vec![Complaint::new(0, Stream::Color, reason)];
+        let general = |reason: String| vec![InputError::new(0, Stream::Color, reason)];
         self.last = Some(stamp);
         let report = match &mut self.still {
             None => self.fusion.fuse(&views, &mut self.heightmap).map(Some),
@@ -405,27 +405,27 @@ impl CameraState {
         reference: Duration,
         transforms: &Transforms,
         world_frame: &str,
-    ) -> Result<(Camera, Used), Vec<Complaint>> {
-        let complaint = |stream, reason: String| Complaint::new(index, stream, reason);
+    ) -> Result<(Camera, Used), Vec<InputError>> {
+        let invalid = |stream, reason: String| InputError::new(index, stream, reason);
         let nearest = |waiting: &VecDeque<(Duration, Image)>| {
             let stamps = waiting.iter().map(|(stamp, _)| stamp.abs_diff(reference));
             let nearest = stamps.enumerate().min_by_key(|(_, distance)| *distance);
             nearest.map(|(position, _)| position)
         };
         let (Some(color), Some(depth)) = (nearest(&self.color), nearest(&self.depth)) else {
-            return Err(vec![complaint(Stream::Color, "no image".into())]);
+            return Err(vec![invalid(Stream::Color, "no image".into())]);
         };
         let intrinsics = match &self.intrinsics {
             Some(Ok(intrinsics)) => *intrinsics,
             Some(Err(reason)) => {
-                return Err(vec![complaint(
+                return Err(vec![invalid(
                     Stream::Info,
                     format!("images cannot be used without a valid calibration: {reason}"),
                 )]);
             }
             None => {
                 let reason = "images cannot be used without a calibration, none has arrived";
-                return Err(vec![Complaint::pending(index, Stream::Info, reason)]);
+                return Err(vec![InputError::pending(index, Stream::Info, reason)]);
             }
         };
         let frame = &self.color[color].1.header.frame_id;
@@ -437,7 +437,7 @@ impl CameraState {
             Ok(pose) => pose,
             Err(error) => {
                 let reason = format!("header.frame_id: {error}");
-                return Err(vec![Complaint::pending(index, Stream::Color, reason)]);
+                return Err(vec![InputError::pending(index, Stream::Color, reason)]);
             }
         };
         let camera = Camera {
@@ -446,7 +446,7 @@ impl CameraState {
             world_from_camera,
         };
         if let Err(error) = camera.check() {
-            return Err(vec![complaint(Stream::Info, error.to_string())]);
+            return Err(vec![invalid(Stream::Info, error.to_string())]);
         }
         let used = Used {
             color: self.color[color].0,
@@ -456,7 +456,7 @@ impl CameraState {
         if let Err(error) =
             convert::color_from_msg(&self.color[color].1, &intrinsics, &mut self.rgb)
         {
-            bad.push(complaint(Stream::Color, error.to_string()));
+            bad.push(invalid(Stream::Color, error.to_string()));
             self.color.remove(color);
         }
         match self.register(index, color, depth, &camera, transforms) {
@@ -484,8 +484,8 @@ impl CameraState {
         depth: usize,
         camera: &Camera,
         transforms: &Transforms,
-    ) -> Result<(), Complaint> {
-        let refuse = |stream, reason: String| Complaint::new(index, stream, reason);
+    ) -> Result<(), InputError> {
+        let refuse = |stream, reason: String| InputError::new(index, stream, reason);
         let image = &self.depth[depth].1;
         let size_px = (image.width as usize, image.height as usize);
         // A colour image that was refused has left the queue.
@@ -519,7 +519,7 @@ impl CameraState {
         );
         let Some(color_from_depth) = transforms.between(color_frame, depth_frame) else {
             let reason = format!("{differ}, or transforms between the two frames");
-            return Err(Complaint::pending(index, Stream::Depth, reason));
+            return Err(InputError::pending(index, Stream::Depth, reason));
         };
         let intrinsics = match &self.depth_intrinsics {
             Some(Ok(intrinsics)) => *intrinsics,
@@ -531,7 +531,7 @@ impl CameraState {
             None => {
                 let reason =
                     format!("{differ}, or a calibration of the depth image, none has arrived");
-                return Err(Complaint::pending(index, Stream::DepthInfo, reason));
+                return Err(InputError::pending(index, Stream::DepthInfo, reason));
             }
         };
         let depth_camera = Camera {
@@ -572,13 +572,13 @@ mod tests {
         distortion: Distortion::NONE,
     };
 
-    fn views() -> Views {
+    fn views() -> FrameSynchronizer {
         let parameters = CameraFusionParameters {
             cameras: vec!["front".into(), "left".into()],
             tolerance_s: 0.02,
             ..CameraFusionParameters::default()
         };
-        Views::new(&parameters, BTreeMap::new())
+        FrameSynchronizer::new(&parameters, BTreeMap::new())
     }
 
     fn header(stamp: Duration, frame: &str) -> Header {
@@ -614,21 +614,21 @@ mod tests {
         convert::depth_to_msg(header(stamp, frame), &CAMERA, &depth_m).unwrap()
     }
 
-    fn calibrate(views: &mut Views) {
+    fn calibrate(views: &mut FrameSynchronizer) {
         for camera in 0..2 {
             let info = convert::intrinsics_to_msg(Header::default(), &CAMERA);
             views.calibrate(camera, Stream::Info, &info).unwrap();
         }
     }
 
-    fn ready() -> Views {
+    fn ready() -> FrameSynchronizer {
         let mut views = views();
         assert!(views.transform(extrinsics(&["front", "left"])).is_empty());
         calibrate(&mut views);
         views
     }
 
-    fn send(views: &mut Views, camera: usize, stamp_ms: u64) {
+    fn send(views: &mut FrameSynchronizer, camera: usize, stamp_ms: u64) {
         let frame = ["front", "left"][camera];
         let stamp = Duration::from_millis(stamp_ms);
         views
@@ -639,7 +639,7 @@ mod tests {
             .unwrap();
     }
 
-    fn fused_stamp_ms(views: &mut Views) -> Option<u128> {
+    fn fused_stamp_ms(views: &mut FrameSynchronizer) -> Option<u128> {
         let (fused, complaints) = views.fuse();
         assert!(complaints.is_empty(), "{complaints:?}");
         let fused = fused?;
@@ -729,7 +729,7 @@ mod tests {
                 fuse_without_silent: without,
                 ..CameraFusionParameters::default()
             };
-            let mut views = Views::new(&parameters, BTreeMap::new());
+            let mut views = FrameSynchronizer::new(&parameters, BTreeMap::new());
             views.transform(extrinsics(&["front", "left"]));
             calibrate(&mut views);
             send(&mut views, 0, 1000);
@@ -839,8 +839,8 @@ mod tests {
         let mut views = ready();
         let mut info = convert::intrinsics_to_msg(Header::default(), &CAMERA);
         info.k[0] = 0.0;
-        let complaint = views.calibrate(1, Stream::Info, &info).unwrap_err();
-        assert_eq!((complaint.camera, complaint.stream), (1, Stream::Info));
+        let error = views.calibrate(1, Stream::Info, &info).unwrap_err();
+        assert_eq!((error.camera, error.stream), (1, Stream::Info));
         send(&mut views, 0, 1000);
         send(&mut views, 1, 1000);
         assert_eq!(views.fuse().1[0].stream, Stream::Info);
@@ -880,7 +880,7 @@ mod tests {
             frames: 3,
             ..CameraFusionParameters::default()
         };
-        let mut views = Views::new(&parameters, BTreeMap::new());
+        let mut views = FrameSynchronizer::new(&parameters, BTreeMap::new());
         views.transform(extrinsics(&["front", "left"]));
         // A point in every cell that it sees.
         let dense = Intrinsics {
@@ -928,7 +928,10 @@ mod tests {
     }
 
     /// Both cameras, with this depth image of the second one.
-    fn fuse_with_depth(views: &mut Views, depth: Image) -> (Option<Fused>, Vec<Complaint>) {
+    fn fuse_with_depth(
+        views: &mut FrameSynchronizer,
+        depth: Image,
+    ) -> (Option<Fused>, Vec<InputError>) {
         send(views, 0, 1000);
         send(views, 1, 1000);
         views.image(1, Stream::Depth, depth).unwrap();
@@ -1030,10 +1033,7 @@ mod tests {
         let mut views = ready();
         let mut image = color(Duration::ZERO, "front");
         image.header.stamp.nanosec = u32::MAX;
-        let complaint = views.image(0, Stream::Color, image).unwrap_err();
-        assert!(
-            complaint.reason.starts_with("header.stamp"),
-            "{complaint:?}"
-        );
+        let error = views.image(0, Stream::Color, image).unwrap_err();
+        assert!(error.reason.starts_with("header.stamp"), "{error:?}");
     }
 }

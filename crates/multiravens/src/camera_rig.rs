@@ -13,7 +13,7 @@ const CYLINDER_SEGMENTS: usize = 32;
 const BALL_SEGMENTS: usize = 12;
 
 /// The scene, the cameras and their images, kept from frame to frame.
-pub(crate) struct Stage {
+pub(crate) struct CameraRig {
     scene: Scene,
     cameras: Vec<Camera>,
     images: Vec<RgbdImage>,
@@ -23,7 +23,7 @@ pub(crate) struct Stage {
     clutter: Vec<ClutterItem>,
 }
 
-impl Stage {
+impl CameraRig {
     pub(crate) fn new(cameras: Vec<Camera>) -> Self {
         let images = cameras.iter().map(|c| RgbdImage::new(&c.intrinsics));
         Self {

@@ -17,7 +17,7 @@ from catkin_pkg.packages import find_packages
 from processes import BINARIES, REPOSITORY
 
 PACKAGE = REPOSITORY / "nodes"
-NODES = ["camera_fusion", "gctn_policy", "goal_oracle", "operator_console", "sim_workcell", "suction_executor"]
+NODES = ["camera_fusion", "gctn_policy", "goal_oracle", "motion_watchdog", "operator_console", "sim_workcell", "suction_executor"]
 LAUNCH_FILES = sorted((PACKAGE / "launch").glob("*.launch.py"))
 
 

@@ -57,7 +57,9 @@ def generate_launch_description() -> LaunchDescription:
             node("camera_fusion"),
             node("goal_oracle", demonstration=LaunchConfiguration("demonstration"), start_empty=True),
             node("gctn_policy", checkpoint=LaunchConfiguration("checkpoint")),
-            node("suction_executor", urdf=share("urdf", "workcell.urdf")),
+            # Simulated cables are pulled until they lag behind.
+            node("suction_executor", urdf=share("urdf", "workcell.urdf"), driver={"lag_rule": True}),
+            node("motion_watchdog"),
             node(
                 "operator_console",
                 condition=IfCondition(LaunchConfiguration("console")),

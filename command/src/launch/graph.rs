@@ -102,6 +102,8 @@ impl Settings {
                 ("require_approval", self.require_approval.name().to_owned()),
                 ("sure_probability", self.sure_probability.to_string()),
                 ("require_presence", self.require_presence.to_string()),
+                // Simulated cables are pulled until they lag behind.
+                ("driver.lag_rule", "true".to_owned()),
             ],
             _ => Vec::new(),
         }

@@ -1,6 +1,6 @@
 //! The primitive as a state machine: reports in, commands out, no robot inside.
 
-use crate::{PrimitiveSettings, SettingsError};
+use crate::{PrimitiveSettings, SettingsError, Touchdown};
 use nalgebra::{Isometry2, Isometry3};
 use serde::{Deserialize, Serialize};
 use std::f64::consts::{FRAC_PI_2, PI};
@@ -112,6 +112,15 @@ pub enum PrimitiveError {
     /// The arm lagged behind with nothing held: something is in its way.
     #[error("{phase:?}: the arm lags behind although it holds nothing, something is in its way")]
     Blocked { phase: Phase },
+    /// The tip met something where nothing was seen.
+    #[error(
+        "{phase:?}: contact at a height of {height_m:.4} m, expected at most {highest_m:.4} m: something is in the way"
+    )]
+    UnexpectedContact {
+        phase: Phase,
+        height_m: f64,
+        highest_m: f64,
+    },
     /// A report that does not answer the last command.
     #[error("{phase:?}: {report:?} does not answer the last command")]
     UnexpectedReport { phase: Phase, report: Report },
@@ -147,7 +156,23 @@ pub struct Primitive<'a> {
     joints: Joints,
     /// Height of the transfer, known since the contact.
     carry_m: f64,
+    /// Height of the tip at the contact with the object.
+    contact_m: f64,
+    /// How the tip comes down, where the surfaces are known.
+    touchdown: Option<Touchdown>,
+    descent: Descent,
     outcome: Outcome,
+}
+
+/// Where a descent in several parts stands.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Descent {
+    /// Fast, to above the surface.
+    Fast,
+    /// Slowly, until contact.
+    Slow,
+    /// Down by a little more, to press the cup on.
+    Press,
 }
 
 impl<'a> Primitive<'a> {
@@ -198,8 +223,21 @@ impl<'a> Primitive<'a> {
             approaching: false,
             joints: *joints,
             carry_m: settings.lift_m,
+            contact_m: 0.0,
+            touchdown: None,
+            descent: Descent::Slow,
             outcome: Outcome::Placed,
         })
+    }
+
+    /// Comes down on surfaces whose heights are known: fast, then slowly, and only contact near the surface is taken for it.
+    ///
+    /// # Errors
+    /// When one of the heights, speeds or distances is out of range.
+    pub fn with_touchdown(mut self, touchdown: &Touchdown) -> Result<Self, PrimitiveError> {
+        touchdown.check()?;
+        self.touchdown = Some(*touchdown);
+        Ok(self)
     }
 
     /// Where the primitive stands.
@@ -233,11 +271,23 @@ impl<'a> Primitive<'a> {
             (Phase::Approach, Report::Arrived(_)) if !self.approaching => self.approach()?,
             (Phase::Approach, Report::Arrived(_)) => {
                 self.phase = Phase::DescendToPick;
-                self.descend(&self.pick)?
+                self.begin_descent()?
+            }
+            (Phase::DescendToPick | Phase::DescendToPlace, Report::Arrived(_))
+                if self.descent == Descent::Fast =>
+            {
+                self.descend_slowly()?
             }
             (Phase::DescendToPick, Report::Contact(_)) => {
-                self.phase = Phase::Grasp;
-                Command::SetSuction(true)
+                self.check_contact()?;
+                self.contact_m = self.height_m();
+                match self.press()? {
+                    Some(press) => press,
+                    None => self.grasp(),
+                }
+            }
+            (Phase::DescendToPick, Report::Arrived(_)) if self.descent == Descent::Press => {
+                self.grasp()
             }
             (Phase::DescendToPick, Report::NoContact(_)) => {
                 self.outcome = Outcome::NoContact;
@@ -245,8 +295,7 @@ impl<'a> Primitive<'a> {
             }
             (Phase::Grasp, Report::SuctionSet) => {
                 self.phase = Phase::Lift;
-                let contact_m = self.arm.tip(&self.joints).translation.z;
-                self.carry_m = contact_m + self.settings.lift_m;
+                self.carry_m = self.contact_m + self.settings.lift_m;
                 let height_m = self.carry_m.min(self.ceiling_m.0);
                 self.line(
                     &Arm::tip_down(&self.pick, height_m),
@@ -269,9 +318,12 @@ impl<'a> Primitive<'a> {
             (Phase::Transfer, Report::Arrived(_)) => Command::ReadVacuum,
             (Phase::Transfer, Report::Holds(true)) => {
                 self.phase = Phase::DescendToPlace;
-                self.descend(&self.place)?
+                self.begin_descent()?
             }
             (Phase::DescendToPlace, Report::Contact(_) | Report::NoContact(_)) => {
+                if let Report::Contact(_) = report {
+                    self.check_contact()?;
+                }
                 self.phase = Phase::Release;
                 Command::ReadVacuum
             }
@@ -285,7 +337,13 @@ impl<'a> Primitive<'a> {
             (Phase::Approach | Phase::Lift | Phase::Transfer, Report::Lagged(_)) => {
                 self.give_up(Outcome::LagAborted)
             }
-            (phase @ (Phase::Retreat | Phase::Home), Report::Lagged(_)) => {
+            (
+                phase @ (Phase::DescendToPick
+                | Phase::DescendToPlace
+                | Phase::Retreat
+                | Phase::Home),
+                Report::Lagged(_),
+            ) => {
                 return Err(PrimitiveError::Blocked { phase });
             }
             (phase, report) => return Err(PrimitiveError::UnexpectedReport { phase, report }),
@@ -315,10 +373,112 @@ impl<'a> Primitive<'a> {
         self.joint_space(&above)
     }
 
-    fn descend(&self, pose: &Isometry2<f64>) -> Result<Command, PrimitiveError> {
-        let to = Arm::tip_down(pose, LOWEST_M);
-        self.plan_line(&to, self.settings.descend_m_s)
+    /// Height of the tip where the arm is.
+    fn height_m(&self) -> f64 {
+        self.arm.tip(&self.joints).translation.z
+    }
+
+    /// Where the descent under way leads to.
+    fn below(&self) -> &Isometry2<f64> {
+        match self.phase {
+            Phase::DescendToPlace => &self.place,
+            _ => &self.pick,
+        }
+    }
+
+    /// Whether the robot senses the contact of the descent under way.
+    fn senses(&self, touchdown: &Touchdown) -> bool {
+        match self.phase {
+            Phase::DescendToPlace => touchdown.senses_place,
+            _ => touchdown.senses_pick,
+        }
+    }
+
+    /// Height of the tip at which contact is expected, at most.
+    fn expected_m(&self, touchdown: &Touchdown) -> f64 {
+        match self.phase {
+            // The object is as high as it stood over what is lowest beside it.
+            Phase::DescendToPlace => {
+                touchdown.place_m + (self.contact_m - touchdown.pick_ground_m).max(0.0)
+            }
+            _ => touchdown.pick_m,
+        }
+    }
+
+    /// Down to where the surface is near, where it is known; else straight to contact.
+    fn begin_descent(&mut self) -> Result<Command, PrimitiveError> {
+        let Some(touchdown) = self.touchdown else {
+            self.descent = Descent::Slow;
+            let to = Arm::tip_down(self.below(), LOWEST_M);
+            return self
+                .plan_line(&to, self.settings.descend_m_s)
+                .map(Command::FollowUntilContact);
+        };
+        let slow_m = self.expected_m(&touchdown) + touchdown.slow_from_m;
+        if self.height_m() <= slow_m {
+            return self.descend_slowly();
+        }
+        self.descent = Descent::Fast;
+        self.line(
+            &Arm::tip_down(self.below(), slow_m),
+            self.settings.descend_m_s,
+        )
+    }
+
+    fn descend_slowly(&mut self) -> Result<Command, PrimitiveError> {
+        self.descent = Descent::Slow;
+        let Some(touchdown) = self.touchdown else {
+            return self.begin_descent();
+        };
+        let end_m = match (self.phase, self.senses(&touchdown)) {
+            // An object may be lower than it seemed.
+            (Phase::DescendToPlace, true) => touchdown.place_m - touchdown.window_m,
+            (Phase::DescendToPlace, false) => self.expected_m(&touchdown),
+            (_, true) => touchdown.pick_m - touchdown.window_m,
+            (_, false) => touchdown.pick_m - touchdown.press_m,
+        };
+        let end_m = end_m.max(LOWEST_M).min(self.height_m());
+        let speed_m_s = touchdown.slow_m_s.min(self.settings.descend_m_s);
+        self.plan_line(&Arm::tip_down(self.below(), end_m), speed_m_s)
             .map(Command::FollowUntilContact)
+    }
+
+    /// Refuses contact above the surface that was seen.
+    fn check_contact(&self) -> Result<(), PrimitiveError> {
+        let Some(touchdown) = self.touchdown.filter(|touchdown| self.senses(touchdown)) else {
+            return Ok(());
+        };
+        let (height_m, highest_m) = (
+            self.height_m(),
+            self.expected_m(&touchdown) + touchdown.window_m,
+        );
+        if height_m > highest_m {
+            return Err(PrimitiveError::UnexpectedContact {
+                phase: self.phase,
+                height_m,
+                highest_m,
+            });
+        }
+        Ok(())
+    }
+
+    /// Presses the cup on the object, where that is asked for.
+    fn press(&mut self) -> Result<Option<Command>, PrimitiveError> {
+        let Some(touchdown) = self
+            .touchdown
+            .filter(|touchdown| touchdown.senses_pick && touchdown.press_m > 0.0)
+        else {
+            return Ok(None);
+        };
+        self.descent = Descent::Press;
+        let end_m = self.contact_m - touchdown.press_m;
+        self.line(&Arm::tip_down(&self.pick, end_m), touchdown.slow_m_s)
+            .map(Some)
+    }
+
+    fn grasp(&mut self) -> Command {
+        self.phase = Phase::Grasp;
+        Command::SetSuction(true)
     }
 
     fn retreat(&mut self) -> Result<Command, PrimitiveError> {

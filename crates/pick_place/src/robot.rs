@@ -1,7 +1,7 @@
 //! The robot as the primitive sees it.
 
 use crate::primitive::{Command, Next, Primitive, plan_rise};
-use crate::{Outcome, Phase, PickPlace, PrimitiveError, PrimitiveSettings, Report};
+use crate::{Outcome, Phase, PickPlace, PrimitiveError, PrimitiveSettings, Report, Touchdown};
 use ur5::{Arm, JointTrajectory, Joints};
 
 /// The robot as the UR driver shows it: joint trajectories, move until contact, suction.
@@ -42,6 +42,21 @@ pub fn execute<R: Robot>(
     arm: &Arm,
     action: &PickPlace,
     settings: &PrimitiveSettings,
+    observe: impl FnMut(Phase),
+) -> Result<Outcome, ExecuteError<R::Error>> {
+    execute_on(robot, arm, action, settings, None, observe)
+}
+
+/// The same; with a `touchdown` the heights of the surfaces are known, and the tip comes down slowly at the end.
+///
+/// # Errors
+/// Returns at once, without another command to the robot.
+pub fn execute_on<R: Robot>(
+    robot: &mut R,
+    arm: &Arm,
+    action: &PickPlace,
+    settings: &PrimitiveSettings,
+    touchdown: Option<&Touchdown>,
     mut observe: impl FnMut(Phase),
 ) -> Result<Outcome, ExecuteError<R::Error>> {
     let mut phase = Phase::Approach;
@@ -49,6 +64,9 @@ pub fn execute<R: Robot>(
         .joints()
         .map_err(|error| ExecuteError::Robot { phase, error })?;
     let mut primitive = Primitive::new(arm, action, settings, &joints)?;
+    if let Some(touchdown) = touchdown {
+        primitive = primitive.with_touchdown(touchdown)?;
+    }
     observe(phase);
     let mut command = primitive.start();
     loop {

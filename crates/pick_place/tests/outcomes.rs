@@ -3,7 +3,7 @@
 use nalgebra::{Isometry2, Vector2};
 use pick_place::{
     ExecuteError, Outcome, Phase, PickPlace, Primitive, PrimitiveError, PrimitiveSettings, Report,
-    Robot, execute, go_home,
+    Robot, Touchdown, execute, execute_on, go_home,
 };
 use ur5::{Arm, JointTrajectory, Joints, WorkCell};
 
@@ -106,6 +106,11 @@ impl ScriptedRobot {
         let mut phases = Vec::new();
         let outcome = execute(self, &arm, &action(), settings, |phase| phases.push(phase));
         (outcome, phases)
+    }
+
+    fn run_on(&mut self, touchdown: &Touchdown) -> Result<Outcome, ExecuteError<String>> {
+        let (arm, settings) = (self.arm.clone(), PrimitiveSettings::RIGID);
+        execute_on(self, &arm, &action(), &settings, Some(touchdown), |_| ())
     }
 
     fn is_home(&self) -> bool {
@@ -497,4 +502,174 @@ fn the_highest_settings_still_work_in_the_middle_of_the_workspace() {
     };
     assert_eq!(robot.run(&highest).0, Ok(Outcome::Placed));
     assert!(robot.is_home());
+}
+
+/// An object of 40 mm on the table, to be put on the table.
+const TOUCHDOWN: Touchdown = Touchdown {
+    pick_m: 0.04,
+    pick_ground_m: 0.0,
+    place_m: 0.0,
+    slow_from_m: 0.03,
+    slow_m_s: 0.05,
+    window_m: 0.01,
+    press_m: 0.0,
+    senses_pick: true,
+    senses_place: true,
+};
+
+/// Highest speed of the tip in a motion (m/s).
+fn fastest_m_s(arm: &Arm, motion: &JointTrajectory) -> f64 {
+    let heights = motion.points().iter().map(|point| {
+        let tip = arm.tip(&point.positions_rad).translation.vector;
+        (point.time.as_secs_f64(), tip)
+    });
+    let heights: Vec<_> = heights.collect();
+    let speeds = heights.windows(2).map(|pair| {
+        let ((t0, p0), (t1, p1)) = (pair[0], pair[1]);
+        (p1 - p0).norm() / (t1 - t0)
+    });
+    speeds.fold(0.0, f64::max)
+}
+
+#[test]
+fn the_tip_slows_down_above_a_surface_that_is_known() {
+    let mut robot = ScriptedRobot::new();
+    robot.contacts_m = [Some(0.041), Some(0.042)];
+    assert_eq!(robot.run_on(&TOUCHDOWN), Ok(Outcome::Placed));
+    let mut descents = robot
+        .path
+        .iter()
+        .filter(|motion| {
+            let height_m = |joints: &Joints| robot.arm.tip(joints).translation.z;
+            let (from_m, to_m) = (
+                height_m(&motion.points()[0].positions_rad),
+                height_m(&motion.last().positions_rad),
+            );
+            (from_m - 0.07).abs() < 2e-3 && to_m < 0.045
+        })
+        .map(|motion| fastest_m_s(&robot.arm, motion));
+    for _ in 0..2 {
+        let speed_m_s = descents.next().expect("a slow descent");
+        assert!(speed_m_s < 0.0505, "{speed_m_s}");
+    }
+    let fast = robot
+        .seen
+        .iter()
+        .filter(|seen| matches!(seen, Seen::Follow { height_m } if (height_m - 0.07).abs() < 2e-3));
+    assert_eq!(fast.count(), 2);
+}
+
+#[test]
+fn contact_where_nothing_was_seen_ends_the_primitive_and_holds_what_is_held() {
+    let mut robot = ScriptedRobot::new();
+    robot.contacts_m[0] = Some(0.06);
+    let error = robot.run_on(&TOUCHDOWN).unwrap_err();
+    assert!(
+        error.to_string().contains("DescendToPick: contact at"),
+        "{error}"
+    );
+    assert_eq!(suctions(&robot), [false; 0]);
+
+    // At the place the tip is expected at the height of the object, 41 mm.
+    let mut robot = ScriptedRobot::new();
+    robot.contacts_m = [Some(0.041), Some(0.06)];
+    let error = robot.run_on(&TOUCHDOWN).unwrap_err();
+    assert!(
+        error.to_string().contains("DescendToPlace: contact at"),
+        "{error}"
+    );
+    assert_eq!(suctions(&robot), [true]);
+}
+
+#[test]
+fn a_descent_that_meets_nothing_ends_below_the_window() {
+    let mut robot = ScriptedRobot::new();
+    robot.contacts_m[0] = None;
+    assert_eq!(robot.run_on(&TOUCHDOWN), Ok(Outcome::NoContact));
+    let lowest_m = robot.seen.iter().find_map(|seen| match seen {
+        Seen::Descend { height_m } => Some(*height_m),
+        _ => None,
+    });
+    assert!((lowest_m.unwrap() - 0.03).abs() < 1e-6, "{lowest_m:?}");
+}
+
+#[test]
+fn the_cup_is_pressed_on_after_contact() {
+    let touchdown = Touchdown {
+        press_m: 0.002,
+        ..TOUCHDOWN
+    };
+    let mut robot = ScriptedRobot::new();
+    robot.contacts_m = [Some(0.04), Some(0.04)];
+    assert_eq!(robot.run_on(&touchdown), Ok(Outcome::Placed));
+    let at = robot
+        .seen
+        .iter()
+        .position(|seen| *seen == Seen::Suction(true))
+        .unwrap();
+    let (
+        Seen::Descend {
+            height_m: contact_m,
+        },
+        Seen::Follow { height_m },
+    ) = (robot.seen[at - 2], robot.seen[at - 1])
+    else {
+        panic!("{:?}", robot.seen);
+    };
+    assert!((contact_m - 0.002 - height_m).abs() < 1e-6);
+}
+
+#[test]
+fn without_a_sense_of_contact_the_heights_that_were_seen_are_taken_for_it() {
+    let touchdown = Touchdown {
+        senses_pick: false,
+        senses_place: false,
+        press_m: 0.003,
+        place_m: 0.01,
+        ..TOUCHDOWN
+    };
+    let mut robot = ScriptedRobot::new();
+    // Such a robot says contact at the end of its way.
+    robot.contacts_m = [Some(0.0371), None];
+    assert_eq!(robot.run_on(&touchdown), Ok(Outcome::Placed));
+    let ends: Vec<f64> = robot
+        .seen
+        .iter()
+        .filter_map(|seen| match seen {
+            Seen::Descend { height_m } => Some(*height_m),
+            _ => None,
+        })
+        .collect();
+    // Down to 37 mm, which is as high as the object then hangs below the tip.
+    assert!(
+        (ends[0] - 0.037).abs() < 2e-4 && (ends[1] - 0.047).abs() < 2e-4,
+        "{ends:?}"
+    );
+}
+
+#[test]
+fn what_is_held_is_put_down_by_height_where_only_the_empty_tool_senses_contact() {
+    let touchdown = Touchdown {
+        senses_place: false,
+        ..TOUCHDOWN
+    };
+    let mut robot = ScriptedRobot::new();
+    robot.contacts_m = [Some(0.041), None];
+    assert_eq!(robot.run_on(&touchdown), Ok(Outcome::Placed));
+    let end_m = robot.seen.iter().rev().find_map(|seen| match seen {
+        Seen::Descend { height_m } => Some(*height_m),
+        _ => None,
+    });
+    // Not to below the table: the object hangs below the tip, as high as it stood.
+    assert!((end_m.unwrap() - 0.041).abs() < 1e-3, "{end_m:?}");
+}
+
+#[test]
+fn heights_out_of_range_are_refused_by_name() {
+    let touchdown = Touchdown {
+        window_m: f64::NAN,
+        ..TOUCHDOWN
+    };
+    let error = ScriptedRobot::new().run_on(&touchdown).unwrap_err();
+    assert!(error.to_string().contains("window_m"), "{error}");
 }

@@ -377,6 +377,11 @@ impl ApprovalGate {
         self.rules = rules;
     }
 
+    /// Nothing moves by itself before the next approval: a stop or fault came before this gate was made.
+    pub fn remember_stop(&mut self) {
+        self.automatic = false;
+    }
+
     /// The proposal that is being carried out.
     pub fn moving(&self) -> Option<ProposalId> {
         self.moving

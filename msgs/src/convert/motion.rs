@@ -1,11 +1,12 @@
 //! Poses, proposals, joints and trajectories.
 
 use super::error::{all_finite, finite, positive, size, unexpected};
-use super::{ConvertError, duration_from_msg, duration_to_msg};
+use super::{ConvertError, duration_from_msg, duration_to_msg, time_from_msg};
 use crate::{geometry_msgs, sctn_msgs, sensor_msgs, std_msgs, trajectory_msgs};
 use ::pick_place::{Outcome, Phase, PickPlace, PrimitiveSettings};
 use nalgebra::{Isometry2, Isometry3, Quaternion, Translation3, Unit, UnitQuaternion};
 use std::f64::consts::TAU;
+use std::time::Duration;
 use step_protocol::StepOutcome;
 use ur5::{JointTrajectory, Joints, TrajectoryPoint};
 
@@ -171,6 +172,39 @@ pub fn joints_from_msg(
     Ok(joints)
 }
 
+/// Positions and velocities of the joints at a time.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct JointReading {
+    /// Capture time.
+    pub stamp: Duration,
+    /// Positions.
+    pub positions_rad: Joints,
+    /// Velocities; zero where the message has none.
+    pub velocities_rad_s: Joints,
+}
+
+/// Positions and velocities in the order of `names`; the message may have them in any order, and others beside.
+pub fn joint_reading_from_msg(
+    state: &sensor_msgs::JointState,
+    names: &[impl AsRef<str>; 6],
+) -> Result<JointReading, ConvertError> {
+    let velocities_rad_s = if state.velocity.is_empty() {
+        Joints::zeros()
+    } else {
+        let speeds = sensor_msgs::JointState {
+            name: state.name.clone(),
+            position: state.velocity.clone(),
+            ..Default::default()
+        };
+        joints_from_msg(&speeds, names)?
+    };
+    Ok(JointReading {
+        stamp: time_from_msg(&state.header.stamp)?,
+        positions_rad: joints_from_msg(state, names)?,
+        velocities_rad_s,
+    })
+}
+
 /// Positions and velocities of the joints.
 pub fn joint_state_to_msg(
     header: std_msgs::Header,
@@ -258,7 +292,6 @@ pub fn joint_trajectory_to_msg(
 mod tests {
     use super::*;
     use proptest::prelude::*;
-    use std::time::Duration;
 
     const NAMES: [&str; 6] = ["a", "b", "c", "d", "e", "f"];
 
@@ -269,6 +302,32 @@ mod tests {
             velocities_rad_s: Joints::repeat(-value),
         };
         JointTrajectory::new(vec![point(0, 0.0), point(20, 0.1), point(40, 1.0 / 3.0)]).unwrap()
+    }
+
+    #[test]
+    fn joints_are_read_by_name() {
+        let mut message = sensor_msgs::JointState {
+            name: ["gripper", "f", "e", "d", "c", "b", "a"]
+                .map(String::from)
+                .to_vec(),
+            position: vec![9.0, 6.0, 5.0, 4.0, 3.0, 2.0, 1.0],
+            velocity: vec![0.9, 0.6, 0.5, 0.4, 0.3, 0.2, 0.1],
+            ..Default::default()
+        };
+        let reading = joint_reading_from_msg(&message, &NAMES).unwrap();
+        assert_eq!(
+            reading.positions_rad,
+            Joints::new(1.0, 2.0, 3.0, 4.0, 5.0, 6.0)
+        );
+        assert_eq!(
+            reading.velocities_rad_s,
+            Joints::new(0.1, 0.2, 0.3, 0.4, 0.5, 0.6)
+        );
+        message.velocity.clear();
+        let reading = joint_reading_from_msg(&message, &NAMES).unwrap();
+        assert_eq!(reading.velocities_rad_s, Joints::zeros());
+        message.name.pop();
+        assert!(joint_reading_from_msg(&message, &NAMES).is_err());
     }
 
     proptest! {

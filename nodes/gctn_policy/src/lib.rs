@@ -3,6 +3,7 @@
 //! When to propose is decided in [`ProposalPlanner`], which knows no ROS node; the network runs on a thread of
 //! its own.
 
+mod arm_view;
 mod parameters;
 mod picture;
 
@@ -24,6 +25,8 @@ use node_kit::{Active, Level, Node, Publisher, Qos};
 use step_protocol::{Job, PlannerRules, Prediction, Proposal, ProposalPlanner};
 use tokio::sync::mpsc;
 use tracing::{info, warn};
+
+use arm_view::ArmView;
 
 pub use parameters::GctnPolicyParameters;
 pub use picture::{markers, score_image};
@@ -91,15 +94,18 @@ impl Active for PolicyNode {
         let mut changes = node.parameters::<GctnPolicyParameters>();
         let rules = rules_of(&changes.borrow_and_update(), node);
         let mut planner = ProposalPlanner::new(rules);
+        let mut arm_view = ArmView::new(node, &changes.borrow())?;
         loop {
             let job = tokio::select! {
                 message = heightmaps.recv() => match convert::observation_from_msg(message) {
+                    Ok(observation) if arm_view.may_show_arm(observation.stamp) => None,
                     Ok(observation) => planner.on_heightmap(observation),
                     Err(error) => {
                         heightmaps.reject(error);
                         None
                     }
                 },
+                () = arm_view.follow() => None,
                 message = goals.recv() => match convert::goal_from_msg(message) {
                     Ok(goal) => {
                         // What was published before the goal is to be known before it: confirmations and results lead to goals.

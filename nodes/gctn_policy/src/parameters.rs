@@ -15,6 +15,8 @@ pub struct GctnPolicyParameters {
     pub exclusion_radius_m: f64,
     pub observation_tolerance_m: f64,
     pub observation_changed_area_mm2: f64,
+    pub observation_needs_home: bool,
+    pub urdf: PathBuf,
 }
 
 impl Default for GctnPolicyParameters {
@@ -25,6 +27,8 @@ impl Default for GctnPolicyParameters {
             exclusion_radius_m: 0.02,
             observation_tolerance_m: 0.005,
             observation_changed_area_mm2: 75.0,
+            observation_needs_home: false,
+            urdf: PathBuf::new(),
         }
     }
 }

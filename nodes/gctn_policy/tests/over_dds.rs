@@ -8,12 +8,13 @@ use heightmap::Workspace;
 use msgs::{
     convert,
     sctn_msgs::{Goal, Heightmap, PickPlace, PrimitiveSettings, StepConfirmation, StepResult},
-    sensor_msgs::Image,
+    sensor_msgs::{Image, JointState},
 };
 use node_kit::{
     Context, Network as DdsNetwork, NoParameters, ParameterSource, Qos, RosArguments, Subscription,
 };
 use tokio::time::timeout;
+use ur5::{Joints, WorkCell};
 
 const LIMIT: Duration = Duration::from_secs(60);
 const CELLS: usize = 32;
@@ -69,6 +70,16 @@ fn goal(attempt: u32) -> Goal {
     }
 }
 
+/// The checkpoint of a small network.
+fn untrained(directory: &tempfile::TempDir) -> std::path::PathBuf {
+    let checkpoint = directory.path().join("small.safetensors");
+    Trainer::new(&network(), &TrainingConfig::compact())
+        .unwrap()
+        .save_checkpoint(&checkpoint, Storage::F32, &ModelCard::new())
+        .unwrap();
+    checkpoint
+}
+
 async fn next(proposals: &mut Subscription<PickPlace>) -> PickPlace {
     timeout(LIMIT, proposals.recv()).await.expect("a proposal")
 }
@@ -76,11 +87,7 @@ async fn next(proposals: &mut Subscription<PickPlace>) -> PickPlace {
 #[tokio::test(flavor = "multi_thread")]
 async fn proposals_follow_goals_rejections_and_changed_scenes() {
     let directory = tempfile::tempdir().unwrap();
-    let checkpoint = directory.path().join("small.safetensors");
-    Trainer::new(&network(), &TrainingConfig::compact())
-        .unwrap()
-        .save_checkpoint(&checkpoint, Storage::F32, &ModelCard::new())
-        .unwrap();
+    let checkpoint = untrained(&directory);
     let context = Context::new(DdsNetwork::unused().unwrap());
     let (node, _) = context
         .node::<NoParameters>("others", &RosArguments::default())
@@ -184,4 +191,65 @@ async fn without_a_checkpoint_the_node_refuses_to_start() {
         .unwrap();
     let error = policy.await.unwrap().unwrap_err().to_string();
     assert!(error.contains("checkpoint"), "{error}");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_heightmap_that_may_show_the_arm_makes_no_proposal() {
+    let directory = tempfile::tempdir().unwrap();
+    let checkpoint = untrained(&directory);
+    let context = Context::new(DdsNetwork::unused().unwrap());
+    let (node, _) = context
+        .node::<NoParameters>("others", &RosArguments::default())
+        .unwrap();
+    let heightmaps = node
+        .publisher::<Heightmap>("heightmap", Qos::Latched)
+        .unwrap();
+    let goals = node.publisher::<Goal>("goal", Qos::Latched).unwrap();
+    let joint_states = node
+        .publisher::<JointState>("joint_states", Qos::Event)
+        .unwrap();
+    let mut proposals = node
+        .subscription::<PickPlace>("pick_place", Qos::Latched)
+        .unwrap();
+    let line = [
+        "--ros-args",
+        "-p",
+        &format!("checkpoint:={}", checkpoint.display()),
+        "-p",
+        "observation_needs_home:=true",
+    ];
+    let arguments = RosArguments::parse(line.map(String::from)).unwrap().0;
+    let policy = context
+        .start("gctn_policy", &arguments, gctn_policy::configure)
+        .unwrap();
+    let graph = node.graph();
+    assert!(
+        graph
+            .wait_for_subscription(joint_states.topic(), LIMIT)
+            .await
+    );
+    goals.publish(goal(0));
+    let cell = WorkCell::builtin().unwrap();
+    let arm = |stamp_s, offset_rad| {
+        joint_states.publish(convert::joint_state_to_msg(
+            convert::header(Duration::from_secs(stamp_s), "").unwrap(),
+            &cell.joint_names,
+            &cell.arm.home.add_scalar(offset_rad),
+            &Joints::zeros(),
+        ));
+    };
+    // Nobody knows where the arm is; it rests elsewhere; it came home after the heightmap was taken.
+    for (stamp_s, reading) in [(2, None), (4, Some((3, 0.3))), (5, Some((6, 0.0)))] {
+        if let Some((stamp_s, offset_rad)) = reading {
+            arm(stamp_s, offset_rad);
+            tokio::time::sleep(Duration::from_millis(300)).await;
+        }
+        heightmaps.publish(heightmap(CELLS, stamp_s, 0));
+        let none = timeout(Duration::from_secs(1), proposals.recv()).await;
+        assert!(none.is_err(), "{none:?}");
+    }
+    heightmaps.publish(heightmap(CELLS, 7, 0));
+    assert_eq!(next(&mut proposals).await.header.stamp.sec, 7);
+    context.shutdown();
+    policy.await.unwrap().unwrap();
 }

@@ -162,6 +162,13 @@ pub struct HardwareNode {
     until_action: String,
 }
 
+impl Drop for HardwareNode {
+    /// Where the runtime ends without deactivation, the hardware's thread ends too.
+    fn drop(&mut self) {
+        self.shared.stop.store(true, Ordering::Release);
+    }
+}
+
 impl Active for HardwareNode {
     async fn run(&mut self, node: &Node) -> anyhow::Result<()> {
         let mut follow = node.action_server::<FollowJointTrajectory>(&self.follow_action)?;

@@ -10,6 +10,8 @@ mod parameters;
 mod presence;
 mod rehearsal;
 pub mod status;
+mod stop_memory;
+mod surface;
 
 pub use node::{ExecutorNode, configure};
-pub use parameters::{Driver, Limits, SuctionExecutorParameters};
+pub use parameters::{Contact, ContactSign, Driver, Limits, SuctionExecutorParameters};

@@ -5,14 +5,10 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use anyhow::Context as _;
-use heightmap::ChangeRules;
+use heightmap::{ChangeRules, Heightmap};
 use msgs::convert;
 use msgs::sctn_msgs::{self, ExecutePickPlace, ExecutePickPlaceFeedback, ExecutePickPlaceResult};
-use msgs::sensor_msgs::JointState;
-use msgs::std_msgs::Bool;
 use msgs::std_srvs::{Trigger, TriggerResponse};
-use msgs::ur_dashboard_msgs::{RobotMode, SafetyMode};
-use msgs::ur_msgs::{Digital, IOStates};
 use node_kit::{
     ActionServer, Active, Level, NewGoal, Node, Publisher, Qos, RequestId, RunningGoal,
     ServiceServer, Subscription,
@@ -25,24 +21,26 @@ use step_protocol::{
 use tokio::runtime::Handle;
 use tokio::sync::{mpsc, watch};
 use tokio::task::JoinHandle;
+use tokio::time::timeout_at;
 use tokio_util::sync::CancellationToken;
 use tracing::{error, info, warn};
 use ur5::WorkCell;
 
 use crate::driver::{DriverError, DriverRobot, Link};
 use crate::home::go_home;
-use crate::parameters::{Driver, SuctionExecutorParameters};
+use crate::parameters::SuctionExecutorParameters;
 use crate::presence::Presence;
 use crate::rehearsal::RobotNow;
-use crate::status::{DriverStatus, JointReading, Pins, StillRule};
+use crate::status::DriverStatus;
+use crate::stop_memory::StopMemory;
+use crate::surface::touchdown;
 
 /// Calls of `home` that are answered when the arm is there; more fail at once.
 const WAITING_CALLS: usize = 16;
-/// Joints move less than this from one reading to the next while they stand still: the noise of
-/// encoders.
-const STILL_STEP_RAD: f64 = 1e-4;
 /// How long a motion may take to stop when the node is deactivated.
 const STOP_GRACE: Duration = Duration::from_millis(1500);
+/// How long the result of a motion that was stopped at the end takes to be sent.
+const LAST_WORD: Duration = Duration::from_millis(100);
 const DIAGNOSTICS_PERIOD: Duration = Duration::from_millis(500);
 
 /// Loads the work cell and listens to the driver; returns the node that executes proposals.
@@ -58,22 +56,19 @@ pub async fn configure(
     if let Some(warning) = work_cell.warning() {
         warn!("parameter urdf: {warning}");
     }
-    let origin = Instant::now();
-    let status = follow_status(&node, &parameters.driver, &work_cell.joint_names, origin)?;
-    let link = Link::new(
-        &node,
-        &parameters.driver,
-        &work_cell.joint_names,
-        status.clone(),
-        origin,
-    )?;
+    let link = Link::new(&node, &parameters.driver, &work_cell)?;
+    let mut gate = ApprovalGate::new(rules(&parameters));
+    let stop_memory = StopMemory::new(parameters.stop_file.clone());
+    if let Some(reason) = stop_memory.recall().context("parameter stop_file")? {
+        warn!("stopped before this start: {reason}. Nothing moves by itself before an approval");
+        gate.remember_stop();
+    }
     Ok(ExecutorNode {
         results: node.publisher("step_result", Qos::Event)?,
-        gate: ApprovalGate::new(rules(&parameters)),
+        gate,
+        stop_memory,
         link: Arc::new(link),
         work_cell,
-        status,
-        origin,
     })
 }
 
@@ -94,14 +89,14 @@ fn rules(parameters: &SuctionExecutorParameters) -> GateRules {
 pub struct ExecutorNode {
     results: Publisher<sctn_msgs::StepResult>,
     gate: ApprovalGate,
+    stop_memory: StopMemory,
     link: Arc<Link>,
     work_cell: WorkCell,
-    status: watch::Receiver<DriverStatus>,
-    origin: Instant,
 }
 
 impl Active for ExecutorNode {
     async fn run(&mut self, node: &Node) -> anyhow::Result<()> {
+        let _active = self.link.heartbeat.activate(node).await?;
         let parameters = node.parameters::<SuctionExecutorParameters>();
         let (phase_sender, phases) = mpsc::unbounded_channel();
         let executor = Executor {
@@ -120,79 +115,18 @@ impl Active for ExecutorNode {
             phase_sender,
             phases,
             gate: &mut self.gate,
+            stop_memory: self.stop_memory.clone(),
+            seen: None,
             motion: None,
             link: Arc::clone(&self.link),
             node: node.clone(),
             parameters: parameters.borrow().clone(),
             work_cell: self.work_cell.clone(),
-            status: self.status.clone(),
-            origin: self.origin,
+            status: self.link.status.clone(),
+            origin: self.link.origin,
         };
         executor.run(parameters).await
     }
-}
-
-/// Keeps the newest status of the driver.
-fn follow_status(
-    node: &Node,
-    driver: &Driver,
-    joint_names: &[String; 6],
-    origin: Instant,
-) -> anyhow::Result<watch::Receiver<DriverStatus>> {
-    let topic = |name| format!("{}/{name}", driver.io_and_status);
-    let mut joint_states = node.subscription::<JointState>("joint_states", Qos::Event)?;
-    let mut io_states = node.subscription::<IOStates>(&topic("io_states"), Qos::Event)?;
-    let mut robot_modes = node.subscription::<RobotMode>(&topic("robot_mode"), Qos::Latched)?;
-    let mut safety_modes = node.subscription::<SafetyMode>(&topic("safety_mode"), Qos::Latched)?;
-    let mut running = node.subscription::<Bool>(&topic("robot_program_running"), Qos::Latched)?;
-    let joint_names = joint_names.clone();
-    let (suction_pin, vacuum_pin) = (driver.suction_pin, driver.vacuum_pin);
-    let rule = StillRule {
-        speed_rad_s: driver.rest_speed_rad_s,
-        step_rad: STILL_STEP_RAD,
-    };
-    let (sender, receiver) = watch::channel(DriverStatus::default());
-    node.spawn(async move {
-        loop {
-            tokio::select! {
-                message = joint_states.recv() => match JointReading::from_msg(&message, &joint_names) {
-                    Ok(reading) => sender.send_modify(|status| {
-                        status.read_joints(reading, origin.elapsed(), &rule);
-                    }),
-                    Err(error) => joint_states.reject(error),
-                },
-                message = io_states.recv() => {
-                    let suction = level(&message.digital_out_states, suction_pin);
-                    let vacuum = level(&message.digital_in_states, vacuum_pin);
-                    match (suction, vacuum) {
-                        (Some(suction), Some(vacuum)) => sender.send_modify(|status| {
-                            status.read_pins(Pins { suction, vacuum }, origin.elapsed());
-                        }),
-                        _ => io_states.reject(format_args!(
-                            "expected digital_out_states of pin {suction_pin} and digital_in_states of pin {vacuum_pin}"
-                        )),
-                    }
-                }
-                message = robot_modes.recv() => {
-                    sender.send_modify(|status| status.robot_mode = Some(message.mode));
-                }
-                message = safety_modes.recv() => {
-                    sender.send_modify(|status| status.safety_mode = Some(message.mode));
-                }
-                message = running.recv() => {
-                    sender.send_modify(|status| status.program_running = Some(message.data));
-                }
-            }
-        }
-    });
-    Ok(receiver)
-}
-
-fn level(states: &[Digital], pin: u8) -> Option<bool> {
-    states
-        .iter()
-        .find(|state| state.pin == pin)
-        .map(|state| state.state)
 }
 
 /// What moves the arm.
@@ -247,6 +181,9 @@ struct Executor<'a> {
     /// Phases of the motion under way.
     phases: mpsc::UnboundedReceiver<Phase>,
     gate: &'a mut ApprovalGate,
+    stop_memory: StopMemory,
+    /// The newest heightmap and its stamp.
+    seen: Option<(Arc<Heightmap>, Duration)>,
     motion: Option<Motion>,
     link: Arc<Link>,
     status: watch::Receiver<DriverStatus>,
@@ -291,14 +228,21 @@ impl Executor<'_> {
             };
             self.home.respond(call, response);
         }
+        let deadline = tokio::time::Instant::now() + STOP_GRACE;
         if let Some(motion) = &self.motion {
             warn!("deactivated while moving: stopping");
             motion.stop.cancel();
-            let (cause, stopped, ended) =
-                tokio::time::timeout(STOP_GRACE, end_of(&mut self.motion))
-                    .await
-                    .with_context(|| format!("the arm has not stopped after {STOP_GRACE:?}"))?;
+            let (cause, stopped, ended) = timeout_at(deadline, end_of(&mut self.motion))
+                .await
+                .with_context(|| format!("the arm has not stopped after {STOP_GRACE:?}"))?;
             self.on_end(cause, stopped, ended);
+            // The process may end at once.
+            tokio::time::sleep(LAST_WORD).await;
+        }
+        // A goal that is accepted late is cancelled; where this process ends before that, by the watchdog.
+        let quiet = timeout_at(deadline, self.link.heartbeat.quiet()).await;
+        if quiet.is_err() {
+            warn!("the driver has not answered a goal within {STOP_GRACE:?}");
         }
         Ok(())
     }
@@ -344,6 +288,7 @@ impl Executor<'_> {
         }
         match convert::observation_from_msg(message) {
             Ok(seen) => {
+                self.seen = Some((Arc::clone(&seen.heightmap), seen.stamp));
                 self.gate.on_heightmap(seen.stamp, seen.heightmap);
                 self.ask_again();
             }
@@ -516,6 +461,10 @@ impl Executor<'_> {
     }
 
     fn confirm(&mut self, id: ProposalId, decision: OperatorDecision) {
+        if decision == OperatorDecision::Stop {
+            self.stop_memory
+                .remember(&format!("{} of proposal {id}", decision.name()));
+        }
         let (robot, now) = (self.robot(), self.origin.elapsed());
         let actions = self.gate.on_confirmation(id, decision, &robot, now);
         self.act(actions);
@@ -535,6 +484,13 @@ impl Executor<'_> {
             now: self.origin.elapsed(),
             max_age: Duration::from_secs_f64(self.parameters.driver.status_max_age_s),
             unattended: self.unattended(),
+            refused: self.link.refusal(),
+            needs_home: self.parameters.observation_needs_home,
+            time: Duration::from_nanos(self.node.clock().now_ns().max(0) as u64),
+            seen: self.seen.clone(),
+            observation_max_age: Duration::from_secs_f64(self.parameters.observation_max_age_s),
+            contact: self.parameters.contact,
+            sign: self.parameters.driver.contact,
         }
     }
 
@@ -565,6 +521,7 @@ impl Executor<'_> {
 
     fn begin(&mut self, proposal: Proposal) {
         info!("proposal {}: moving", proposal.id);
+        self.stop_memory.forget();
         if let Some(goal) = &mut self.goal {
             goal.moving = goal.id == proposal.id;
         }
@@ -572,6 +529,8 @@ impl Executor<'_> {
         let arm = self.work_cell.arm.clone();
         let diagnostics = self.node.diagnostics().clone();
         let id = proposal.id;
+        let (contact, sign) = (self.parameters.contact, self.parameters.driver.contact);
+        let seen = self.seen.clone();
         let observe = move |phase: Phase| {
             let values = [("proposal_id", id.to_string())];
             diagnostics.set("motion", Level::Ok, format!("{phase:?}"), values);
@@ -582,7 +541,17 @@ impl Executor<'_> {
             let Proposal {
                 action, settings, ..
             } = &proposal;
-            pick_place::execute(robot, &arm, action, settings, observe).map(Some)
+            // The gate has asked for it before: it is there.
+            let touchdown = seen.map(|(seen, _)| touchdown(&seen, action, &contact, sign));
+            let touchdown = touchdown
+                .transpose()
+                .map_err(|reason| ExecuteError::Robot {
+                    phase: Phase::Approach,
+                    error: DriverError::Fault(reason),
+                })?;
+            let touchdown = touchdown.flatten();
+            pick_place::execute_on(robot, &arm, action, settings, touchdown.as_ref(), observe)
+                .map(Some)
         });
     }
 
@@ -665,6 +634,7 @@ impl Executor<'_> {
         };
         let broken_off = matches!(outcome, StepOutcome::Stopped | StepOutcome::Fault);
         if broken_off {
+            self.stop_memory.remember(&reason);
             reason += "; the arm stands where it is, suction is as it was; a new observation and approval are needed";
         } else if stopped {
             reason = format!("the stop came after the end. {reason}")
@@ -756,12 +726,7 @@ impl Executor<'_> {
     }
 
     fn diagnose(&self) {
-        let max_age = Duration::from_secs_f64(self.parameters.driver.status_max_age_s);
-        let obstacle = self
-            .status
-            .borrow()
-            .obstacle(self.origin.elapsed(), max_age);
-        let (level, message) = match obstacle {
+        let (level, message) = match self.link.unready() {
             None => (Level::Ok, "ready".to_owned()),
             Some(obstacle) => (Level::Warn, obstacle),
         };

@@ -17,6 +17,8 @@ pub struct SuctionExecutorParameters {
     pub sure_probability: f64,
     /// Whether nothing moves while no operator is present.
     pub require_presence: bool,
+    /// File that remembers a stop or fault over a restart; empty for none.
+    pub stop_file: PathBuf,
     /// Wall seconds after which an operator who has shown no sign is not present.
     pub presence_timeout_s: f64,
     /// Frame of proposals.
@@ -29,8 +31,14 @@ pub struct SuctionExecutorParameters {
     pub observation_tolerance_m: f64,
     /// The observation has changed where so many mm^2 of connected cells have.
     pub observation_changed_area_mm2: f64,
+    /// Seconds of ROS time; an approval needs a heightmap that is not older.
+    pub observation_max_age_s: f64,
+    /// Whether heightmaps count only where the arm was at home and at rest when they were taken.
+    pub observation_needs_home: bool,
     /// Wall seconds that a confirmation waits for its proposal and heightmap.
     pub confirmation_grace_s: f64,
+    /// How the tip comes down.
+    pub contact: Contact,
     /// The driver and its wiring.
     pub driver: Driver,
 }
@@ -48,6 +56,19 @@ pub enum Approval {
     Never,
 }
 
+/// What tells that the tool touches something.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum ContactSign {
+    /// The driver's action `trajectory_until_node`: e-Series only.
+    #[default]
+    UntilAction,
+    /// The vacuum sensor, suction being on while the tip comes down.
+    Vacuum,
+    /// Nothing: the end of the way down is taken for the contact.
+    Height,
+}
+
 /// Largest heights and speeds that a proposal may ask for.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
@@ -59,6 +80,31 @@ pub struct Limits {
     pub carry_m_s: f64,
     pub descend_m_s: f64,
     pub acceleration_m_s2: f64,
+}
+
+/// How the tip comes down on surfaces that were seen.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct Contact {
+    /// So far above the surface the tip slows down (m); 0: descents are fast to their end.
+    pub slow_from_m: f64,
+    /// Speed of the tip from there on (m/s).
+    pub slow_m_s: f64,
+    /// Contact higher than expected by more is a fault, and a descent ends so far below the surface (m).
+    pub window_m: f64,
+    /// The cup is pressed on by so much after contact (m).
+    pub press_m: f64,
+}
+
+impl Default for Contact {
+    fn default() -> Self {
+        Self {
+            slow_from_m: 0.0,
+            slow_m_s: 0.05,
+            window_m: 0.015,
+            press_m: 0.0,
+        }
+    }
 }
 
 /// The driver and its wiring.
@@ -92,6 +138,25 @@ pub struct Driver {
     pub motion_time_factor: f64,
     /// ... and this much more, in seconds of ROS time.
     pub motion_time_margin_s: f64,
+    /// Whether an arm that leaves its path lets go and goes home, as in the simulated cell, where a cable that is pulled too hard does that.
+    /// On a real arm it may have met something: a fault.
+    pub lag_rule: bool,
+    /// What tells that the tool touches something.
+    pub contact: ContactSign,
+    /// Wall seconds that vacuum may take after suction was switched on.
+    pub grasp_wait_s: f64,
+    /// Wall seconds that vacuum may stay after suction was switched off.
+    pub release_wait_s: f64,
+    /// Digital output that blows the object off, on while it is released; -1 for none.
+    pub blow_off_pin: i8,
+    /// Namespace of `list_controllers`.
+    pub controller_manager: String,
+    /// Whether controllers, the robot's software and the tool's voltage are checked before anything moves.
+    pub check_controllers: bool,
+    /// Wall seconds that an action may take to answer a goal.
+    pub answer_timeout_s: f64,
+    /// Wall seconds within which a motion that was broken off has to come to rest.
+    pub stop_timeout_s: f64,
     /// Wall seconds for each attempt of a call.
     pub call_timeout_s: f64,
     /// Attempts of each call.
@@ -104,13 +169,17 @@ impl Default for SuctionExecutorParameters {
             require_approval: Approval::Always,
             sure_probability: 0.99,
             require_presence: false,
+            stop_file: PathBuf::new(),
             presence_timeout_s: 1.0,
             world_frame: "world".into(),
             urdf: PathBuf::new(),
             limits: Limits::default(),
             observation_tolerance_m: 0.005,
             observation_changed_area_mm2: 75.0,
+            observation_max_age_s: 5.0,
+            observation_needs_home: false,
             confirmation_grace_s: 0.5,
+            contact: Contact::default(),
             driver: Driver::default(),
         }
     }
@@ -141,10 +210,19 @@ impl Default for Driver {
             reading_timeout_s: 5.0,
             rest_speed_rad_s: 1e-3,
             rest_time_s: 0.1,
-            path_tolerance_rad: 0.05,
+            path_tolerance_rad: 0.2,
             goal_tolerance_rad: 0.01,
             motion_time_factor: 3.0,
             motion_time_margin_s: 15.0,
+            lag_rule: false,
+            contact: ContactSign::UntilAction,
+            grasp_wait_s: 0.3,
+            release_wait_s: 1.0,
+            blow_off_pin: -1,
+            controller_manager: "controller_manager".into(),
+            check_controllers: true,
+            answer_timeout_s: 5.0,
+            stop_timeout_s: 1.0,
             call_timeout_s: 1.0,
             call_attempts: 5,
         }
@@ -194,7 +272,12 @@ impl Parameters for SuctionExecutorParameters {
         ("observation_changed_area_mm2", Range::POSITIVE),
         ("sure_probability", Range::SHARE),
         ("presence_timeout_s", Range::POSITIVE),
+        ("observation_max_age_s", TIME),
         ("confirmation_grace_s", TIME),
+        ("contact.slow_from_m", Range::Float(0.0, 0.2)),
+        ("contact.slow_m_s", Range::Float(0.005, 0.5)),
+        ("contact.window_m", Range::Float(0.001, 0.1)),
+        ("contact.press_m", Range::Float(0.0, 0.01)),
         ("driver.suction_pin", PIN),
         ("driver.vacuum_pin", PIN),
         ("driver.status_max_age_s", TIME),
@@ -205,10 +288,16 @@ impl Parameters for SuctionExecutorParameters {
         ("driver.goal_tolerance_rad", Range::POSITIVE),
         ("driver.motion_time_factor", Range::POSITIVE),
         ("driver.motion_time_margin_s", TIME),
+        ("driver.grasp_wait_s", Range::Float(0.0, 60.0)),
+        ("driver.release_wait_s", Range::Float(0.0, 60.0)),
+        ("driver.blow_off_pin", Range::Integer(-1, 17)),
+        ("driver.answer_timeout_s", TIME),
+        ("driver.stop_timeout_s", TIME),
         ("driver.call_timeout_s", TIME),
         ("driver.call_attempts", Range::Integer(1, 100)),
     ];
-    // What needs an approval is not for the network to change while the arm may move.
+    // What protects people is not for the network to change, whether or not the node is configured.
+    const FIXED: &'static [&'static str] = &["require_approval", "require_presence", "stop_file"];
     const CHANGEABLE: &'static [&'static str] = &[
         "limits.clearance_m",
         "limits.lift_m",

@@ -1,13 +1,17 @@
 //! A primitive carried out in thought, to know beforehand whether all of it can be planned.
 
 use std::convert::Infallible;
+use std::sync::Arc;
 use std::time::Duration;
 
+use heightmap::Heightmap;
 use pick_place::Robot;
 use step_protocol::{Proposal, RobotState};
 use ur5::{Arm, JointTrajectory, Joints};
 
+use crate::parameters::{Contact, ContactSign};
 use crate::status::DriverStatus;
+use crate::surface::touchdown;
 
 /// A robot that is always where it was sent, and whose tool finds the table.
 struct Rehearsal {
@@ -51,12 +55,26 @@ pub(crate) struct RobotNow {
     pub max_age: Duration,
     /// Why nothing may begin to move, where an operator has to be present and none is.
     pub unattended: Option<String>,
+    /// What the driver was found to lack.
+    pub refused: Option<String>,
+    /// ROS time.
+    pub time: Duration,
+    /// The newest heightmap and its stamp.
+    pub seen: Option<(Arc<Heightmap>, Duration)>,
+    /// Whether the arm has to have been at home and at rest since the heightmaps were taken.
+    pub needs_home: bool,
+    /// An approval needs a heightmap that is not older.
+    pub observation_max_age: Duration,
+    pub contact: Contact,
+    pub sign: ContactSign,
 }
 
 impl RobotState for RobotNow {
     fn obstacle(&self) -> Option<String> {
         let unattended = self.unattended.clone();
-        unattended.or_else(|| self.status.obstacle(self.now, self.max_age))
+        unattended
+            .or_else(|| self.status.obstacle(self.now, self.max_age))
+            .or_else(|| self.refused.clone())
     }
 
     /// Plans every motion of a proposal from where the robot is.
@@ -71,9 +89,32 @@ impl RobotState for RobotNow {
         let Proposal {
             action, settings, ..
         } = proposal;
-        pick_place::execute(&mut robot, &self.arm, action, settings, |_| ())
-            .map(|_| ())
-            .map_err(|error| one_line(&error.to_string()))
+        let Some((heightmap, stamp)) = &self.seen else {
+            return Err("no heightmap has arrived".into());
+        };
+        let in_view = |stamp| self.status.at_home.may_be_in_view(stamp);
+        if self.needs_home && (in_view(proposal.stamp) || in_view(*stamp)) {
+            return Err("the arm was not at home and at rest when the heightmap was taken, or has left home since: call it home first".into());
+        }
+        let age = self.time.saturating_sub(*stamp);
+        if age > self.observation_max_age {
+            return Err(format!(
+                "the newest heightmap is {:.1} s old, expected at most {:.1} s (observation_max_age_s)",
+                age.as_secs_f64(),
+                self.observation_max_age.as_secs_f64()
+            ));
+        }
+        let touchdown = touchdown(heightmap, action, &self.contact, self.sign)?;
+        pick_place::execute_on(
+            &mut robot,
+            &self.arm,
+            action,
+            settings,
+            touchdown.as_ref(),
+            |_| (),
+        )
+        .map(|_| ())
+        .map_err(|error| one_line(&error.to_string()))
     }
 }
 
@@ -126,6 +167,16 @@ mod tests {
             now: Duration::ZERO,
             max_age: Duration::from_secs(1),
             unattended: None,
+            refused: None,
+            needs_home: false,
+            time: Duration::ZERO,
+            seen: Some((
+                Arc::new(Heightmap::new(heightmap::Workspace::RAVENS)),
+                Duration::ZERO,
+            )),
+            observation_max_age: Duration::from_secs(10),
+            contact: Contact::default(),
+            sign: ContactSign::UntilAction,
         };
         assert_eq!(robot.obstacle(), None);
         robot.plan(&proposal(0.5)).unwrap();
@@ -145,7 +196,46 @@ mod tests {
         });
         let reason = robot.plan(&proposal(0.5)).unwrap_err();
         assert!(reason.contains("already holds"), "{reason}");
-        robot.now = Duration::from_secs(3);
+        robot.status.pins.as_mut().unwrap().value.vacuum = false;
+        robot.plan(&proposal(0.5)).unwrap();
+        robot.time = Duration::from_secs(11);
+        let reason = robot.plan(&proposal(0.5)).unwrap_err();
+        assert!(reason.contains("11.0 s old"), "{reason}");
+        robot.now = Duration::from_secs(11);
         assert!(robot.obstacle().unwrap().contains("joint_states"));
+        robot.now = Duration::ZERO;
+        robot.time = Duration::ZERO;
+        robot.needs_home = true;
+        let read = |robot: &mut RobotNow, stamp_s, offset_rad| {
+            let home = robot.arm.home;
+            let joints = home.add_scalar(offset_rad);
+            let stamp = Duration::from_secs(stamp_s);
+            let status = &mut robot.status;
+            status.at_home.read(stamp, &joints, &Joints::zeros(), &home);
+        };
+        let in_view = |robot: &RobotNow, stamp_s| {
+            let proposal = Proposal {
+                stamp: Duration::from_secs(stamp_s),
+                ..proposal(0.5)
+            };
+            let planned = robot.plan(&proposal);
+            planned.is_err_and(|reason| reason.contains("call it home"))
+        };
+        // Nothing is known; at rest elsewhere; at home since 3 s.
+        assert!(in_view(&robot, 2));
+        read(&mut robot, 1, 0.3);
+        assert!(in_view(&robot, 2));
+        read(&mut robot, 3, 0.0);
+        let heightmap = robot.seen.clone().unwrap().0;
+        robot.seen = Some((Arc::clone(&heightmap), Duration::from_secs(4)));
+        assert!(in_view(&robot, 2));
+        assert!(!in_view(&robot, 3));
+        robot.seen = Some((heightmap, Duration::from_secs(2)));
+        assert!(in_view(&robot, 3));
+        robot.seen = None;
+        let reason = robot.plan(&proposal(0.5)).unwrap_err();
+        assert!(reason.contains("no heightmap"), "{reason}");
+        robot.refused = Some("controller `x` is inactive".into());
+        assert!(robot.obstacle().unwrap().contains("inactive"));
     }
 }

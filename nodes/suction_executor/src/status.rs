@@ -2,26 +2,14 @@
 
 use std::time::Duration;
 
-use msgs::convert::{self, ConvertError};
-use msgs::sensor_msgs::JointState;
-use ur5::Joints;
+use msgs::convert::JointReading;
+use ur5::{AtHome, Joints};
 
 /// `ur_dashboard_msgs/RobotMode`: the only mode in which the arm moves.
 const RUNNING: i8 = 7;
 /// `ur_dashboard_msgs/SafetyMode`: the modes in which the arm moves.
 const NORMAL: u8 = 1;
 const REDUCED: u8 = 2;
-
-/// Positions and velocities of the joints as the driver last published them.
-#[derive(Clone, Copy, Debug, PartialEq)]
-pub struct JointReading {
-    /// Capture time.
-    pub stamp: Duration,
-    /// Positions.
-    pub positions_rad: Joints,
-    /// Velocities; zero where the driver gives none.
-    pub velocities_rad_s: Joints,
-}
 
 /// The pins that the executor looks at.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
@@ -64,6 +52,8 @@ pub struct DriverStatus {
     pub joints: Option<Newest<JointReading>>,
     /// Since when the joints have stood still.
     pub still: Option<Still>,
+    /// Whether the arm is out of the cameras' view.
+    pub at_home: AtHome,
     /// `io_states`
     pub pins: Option<Newest<Pins>>,
 }
@@ -84,27 +74,8 @@ pub struct StillRule {
     pub speed_rad_s: f64,
     /// No joint moves further from one reading to the next.
     pub step_rad: f64,
-}
-
-impl JointReading {
-    /// Reads a message, which may name the joints in any order, and others beside.
-    pub fn from_msg(message: &JointState, names: &[String; 6]) -> Result<Self, ConvertError> {
-        let velocities_rad_s = if message.velocity.is_empty() {
-            Joints::zeros()
-        } else {
-            let speeds = JointState {
-                name: message.name.clone(),
-                position: message.velocity.clone(),
-                ..Default::default()
-            };
-            convert::joints_from_msg(&speeds, names)?
-        };
-        Ok(Self {
-            stamp: convert::time_from_msg(&message.header.stamp)?,
-            positions_rad: convert::joints_from_msg(message, names)?,
-            velocities_rad_s,
-        })
-    }
+    /// Where the arm is out of the cameras' sight (rad).
+    pub home_rad: Joints,
 }
 
 impl DriverStatus {
@@ -116,6 +87,9 @@ impl DriverStatus {
             reading.velocities_rad_s.amax() <= rule.speed_rad_s && step.amax() <= rule.step_rad
         });
         let in_time = before.is_some_and(|before| before.value.stamp == reading.stamp);
+        let (positions, velocities) = (&reading.positions_rad, &reading.velocities_rad_s);
+        self.at_home
+            .read(reading.stamp, positions, velocities, &rule.home_rad);
         self.still = still.then(|| Still {
             since: self.still.map_or(at, |still| still.since),
             in_time,
@@ -219,6 +193,7 @@ pub(crate) mod tests {
                 count: 1,
             }),
             still: None,
+            at_home: AtHome::default(),
             pins: Some(Newest {
                 value: Pins::default(),
                 at: now,
@@ -331,6 +306,7 @@ pub(crate) mod tests {
         let rule = StillRule {
             speed_rad_s: 1e-3,
             step_rad: 1e-4,
+            home_rad: Joints::repeat(1.1),
         };
         let mut status = DriverStatus::default();
         let mut read = |at, stamp, position, speed| {
@@ -351,33 +327,10 @@ pub(crate) mod tests {
         assert_eq!(read(4, 124, 1.00005, 0.01), None);
         assert_eq!(read(5, 132, 1.1, 0.0), None);
         assert_eq!(read(6, 132, 1.1, 0.0), Some((6, true)));
-        assert_eq!(status.joints.unwrap().count, 7);
-    }
-
-    #[test]
-    fn joints_are_read_by_name() {
-        let names = ["a", "b", "c", "d", "e", "f"].map(String::from);
-        let mut message = JointState {
-            name: ["gripper", "f", "e", "d", "c", "b", "a"]
-                .map(String::from)
-                .to_vec(),
-            position: vec![9.0, 6.0, 5.0, 4.0, 3.0, 2.0, 1.0],
-            velocity: vec![0.9, 0.6, 0.5, 0.4, 0.3, 0.2, 0.1],
-            ..Default::default()
-        };
-        let reading = JointReading::from_msg(&message, &names).unwrap();
-        assert_eq!(
-            reading.positions_rad,
-            Joints::new(1.0, 2.0, 3.0, 4.0, 5.0, 6.0)
-        );
-        assert_eq!(
-            reading.velocities_rad_s,
-            Joints::new(0.1, 0.2, 0.3, 0.4, 0.5, 0.6)
-        );
-        message.velocity.clear();
-        let reading = JointReading::from_msg(&message, &names).unwrap();
-        assert_eq!(reading.velocities_rad_s, Joints::zeros());
-        message.name.pop();
-        assert!(JointReading::from_msg(&message, &names).is_err());
+        let _ = read(7, 140, 1.1, 0.0);
+        assert_eq!(status.joints.unwrap().count, 8);
+        // At home since the first slow reading there.
+        assert!(!status.at_home.may_be_in_view(Duration::from_millis(132)));
+        assert!(status.at_home.may_be_in_view(Duration::from_millis(131)));
     }
 }

@@ -528,6 +528,19 @@ async fn deactivating_during_a_motion_stops_the_arm_and_nothing_moves_until_a_ne
 }
 
 #[tokio::test(flavor = "multi_thread")]
+async fn an_executor_that_is_told_to_end_during_a_motion_stops_the_arm_first() {
+    let (mut bench, ..) = proposed(&slow(), &[]).await;
+    bench.decide(1, StepConfirmation::APPROVE);
+    bench.until_moving().await;
+    bench.executor.shutdown();
+    bench.ended(1, StepResult::STOPPED).await;
+    let stopped = bench.joints().await;
+    tokio::time::sleep(Duration::from_secs(1)).await;
+    assert_eq!(bench.joints().await.position, stopped.position);
+    bench.stop().await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
 async fn a_protective_stop_is_a_fault_and_nothing_moves_until_it_is_over() {
     let (mut bench, environment, heightmap) = proposed(&slow(), &[]).await;
     bench.decide(1, StepConfirmation::APPROVE);

@@ -25,6 +25,7 @@ mod raw;
 mod reply_cache;
 mod service;
 mod statistics;
+mod task_group;
 mod topic;
 
 pub use action::{ActionClient, ActionServer, GoalId, GoalStatus, NewGoal, RunningGoal, SentGoal};
@@ -49,4 +50,5 @@ pub use raw::{
 pub use reply_cache::ReplyCache;
 pub use service::{CallError, CallOptions, RequestId, ServiceClient, ServiceServer};
 pub use statistics::{Snapshot, Statistics};
+pub use task_group::TaskGroup;
 pub use topic::{Publisher, Subscription};

@@ -37,6 +37,7 @@ use crate::{
     raw::{self, RawPublisher, RawQos, RawSubscription},
     service::{ServiceClient, ServiceServer},
     statistics::Statistics,
+    task_group::TaskGroup,
     topic::{Publisher, Subscription},
 };
 
@@ -349,6 +350,11 @@ impl Node {
         let end = self.scope.end.clone();
         let task = async move { end.run_until_cancelled(task).await };
         tokio::spawn(task.instrument(self.inner.span.clone()))
+    }
+
+    /// Background tasks that outlive the active and the configured state.
+    pub fn task_group(&self) -> TaskGroup {
+        TaskGroup::new(self.inner.span.clone())
     }
 
     /// Runs blocking work (a network, a simulator) in the node's span on a thread of its own.

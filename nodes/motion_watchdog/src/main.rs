@@ -1,0 +1,5 @@
+//! The executable of the node.
+
+fn main() -> std::process::ExitCode {
+    node_kit::main("motion_watchdog", motion_watchdog::configure)
+}

@@ -1,0 +1,365 @@
+//! The robot of one primitive: joints, suction, vacuum, and ways along trajectories.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use msgs::control_msgs::{FollowJointTrajectoryGoal, FollowJointTrajectoryResult};
+use msgs::ur_msgs::{
+    FollowJointTrajectoryUntilGoal, FollowJointTrajectoryUntilResult, SetIORequest,
+};
+use node_kit::GoalStatus;
+use pick_place::Robot;
+use tokio::runtime::Handle;
+use tokio::time::timeout;
+use tokio_util::sync::CancellationToken;
+use tracing::debug;
+use ur5::{JointTrajectory, Joints};
+
+use super::readiness::Readiness;
+use super::{DriverError, Link};
+use crate::parameters::ContactSign;
+use crate::status::DriverStatus;
+
+/// The robot for one primitive. Its methods block: not for the runtime's own threads.
+pub(crate) struct DriverRobot {
+    link: Arc<Link>,
+    runtime: Handle,
+    stop: CancellationToken,
+    /// Stamp of the joint reading before the motion whose end has not been read yet.
+    left: Option<Duration>,
+    /// Stamps of the first and the last joint reading.
+    pub(crate) stamps: Option<(Duration, Duration)>,
+}
+
+impl DriverRobot {
+    pub(crate) fn new(link: Arc<Link>, runtime: Handle, stop: CancellationToken) -> Self {
+        Self {
+            link,
+            runtime,
+            stop,
+            left: None,
+            stamps: None,
+        }
+    }
+
+    /// Refuses to go on where it must not.
+    fn check(&self) -> Result<(), DriverError> {
+        if self.stop.is_cancelled() {
+            return Err(DriverError::Stopped);
+        }
+        let obstacle = self.link.obstacle();
+        obstacle.map_or(Ok(()), |obstacle| Err(DriverError::Fault(obstacle)))
+    }
+
+    /// Refuses to go on with a driver that lacks something, or whose answer to an earlier goal is still to come. Soon after the start the
+    /// checks may still be under way.
+    async fn ready(&self) -> Result<(), DriverError> {
+        self.check()?;
+        let mut readiness = self.link.readiness.clone();
+        let limit = Duration::from_secs_f64(self.link.parameters.reading_timeout_s);
+        let checked = async {
+            self.link.heartbeat.idle().await;
+            // An error: what was found last counts.
+            let unchecked = |found: &Readiness| matches!(found, Readiness::Unchecked(_));
+            let _ = readiness.wait_for(|found| !unchecked(found)).await;
+        };
+        let checked = tokio::select! {
+            checked = timeout(limit, checked) => checked,
+            () = self.stop.cancelled() => return Err(DriverError::Stopped),
+        };
+        if let Some(reason) = self.link.readiness.borrow().obstacle() {
+            return Err(DriverError::Fault(reason));
+        }
+        checked.map_err(|_| {
+            DriverError::fault("the driver has not answered the goal of an earlier motion yet")
+        })
+    }
+
+    /// Waits until the status is as it should be.
+    async fn wait_for<T>(
+        &self,
+        what: &str,
+        mut look: impl FnMut(&DriverStatus) -> Option<T>,
+    ) -> Result<T, DriverError> {
+        let mut status = self.link.status.clone();
+        let limit = Duration::from_secs_f64(self.link.parameters.reading_timeout_s);
+        let waiting = async {
+            loop {
+                if let Some(found) = look(&status.borrow_and_update()) {
+                    return Ok(found);
+                }
+                tokio::select! {
+                    () = self.stop.cancelled() => return Err(DriverError::Stopped),
+                    changed = status.changed() => changed.map_err(DriverError::fault)?,
+                }
+            }
+        };
+        timeout(limit, waiting).await.unwrap_or_else(|_| {
+            Err(DriverError::Fault(format!(
+                "{what} within {:.1} s",
+                limit.as_secs_f64()
+            )))
+        })
+    }
+
+    async fn read_joints(&mut self) -> Result<Joints, DriverError> {
+        let called = self.link.origin.elapsed();
+        let left = self.left.take();
+        let link = Arc::clone(&self.link);
+        let reading = self
+            .wait_for("the joints have not come to rest", |status| {
+                let joints = status.joints?;
+                let after_motion = left.is_none_or(|left| joints.value.stamp > left);
+                let at_rest = link.rests_since(status, called);
+                (after_motion && at_rest).then_some(joints.value)
+            })
+            .await?;
+        debug!(
+            "at rest after {:?}",
+            self.link.origin.elapsed().saturating_sub(called)
+        );
+        let first = self.stamps.map_or(reading.stamp, |(first, _)| first);
+        self.stamps = Some((first, reading.stamp));
+        Ok(reading.positions_rad)
+    }
+
+    /// Switches an output and waits until the driver says that it is switched.
+    async fn switch_pin(&self, pin: u8, on: bool) -> Result<(), DriverError> {
+        let request = SetIORequest {
+            fun: SetIORequest::FUN_SET_DIGITAL_OUT,
+            pin: pin as i8,
+            state: f32::from(u8::from(on)),
+        };
+        let options = self.link.options();
+        let response = tokio::select! {
+            response = self.link.set_io.call(&request, &options) => response,
+            () = self.stop.cancelled() => return Err(DriverError::Stopped),
+        };
+        if !response.map_err(DriverError::fault)?.success {
+            let level = if on { "on" } else { "off" };
+            return Err(DriverError::Fault(format!(
+                "set_io refused to switch pin {pin} {level}"
+            )));
+        }
+        Ok(())
+    }
+
+    async fn switch_suction(&self, on: bool) -> Result<(), DriverError> {
+        self.ready().await?;
+        let parameters = &self.link.parameters;
+        let called = self.link.origin.elapsed();
+        self.switch_pin(parameters.suction_pin, on).await?;
+        self.wait_for("io_states have not confirmed the suction pin", |status| {
+            let pins = status.pins?;
+            (pins.at >= called && pins.value.suction == on).then_some(())
+        })
+        .await?;
+        if on {
+            // Whether something is held is asked later.
+            self.vacuum_within(parameters.grasp_wait_s, true).await?;
+            return Ok(());
+        }
+        let blow_off = u8::try_from(parameters.blow_off_pin).ok();
+        if let Some(pin) = blow_off {
+            self.switch_pin(pin, true).await?;
+        }
+        let released = self.vacuum_within(parameters.release_wait_s, false).await;
+        if let Some(pin) = blow_off {
+            self.switch_pin(pin, false).await?;
+        }
+        if released? {
+            return Ok(());
+        }
+        Err(DriverError::Fault(format!(
+            "the vacuum sensor says that something is held {:.1} s after suction was switched off",
+            parameters.release_wait_s
+        )))
+    }
+
+    /// Whether the vacuum sensor says so within a time (s), read after now.
+    async fn vacuum_within(&self, limit_s: f64, held: bool) -> Result<bool, DriverError> {
+        let mut status = self.link.status.clone();
+        let seen = status.borrow().pins.map_or(0, |pins| pins.count);
+        let waiting = async {
+            loop {
+                let pins = status.borrow_and_update().pins;
+                if pins.is_some_and(|pins| pins.count >= seen + 2 && pins.value.vacuum == held) {
+                    return Ok(true);
+                }
+                tokio::select! {
+                    () = self.stop.cancelled() => return Err(DriverError::Stopped),
+                    changed = status.changed() => changed.map_err(DriverError::fault)?,
+                }
+            }
+        };
+        let limit = Duration::from_secs_f64(limit_s);
+        timeout(limit, waiting).await.unwrap_or(Ok(false))
+    }
+
+    /// What was sent before the call may still arrive after it; what comes second was sent later.
+    async fn read_vacuum(&self) -> Result<bool, DriverError> {
+        self.check()?;
+        let seen = self.link.status.borrow().pins.map_or(0, |pins| pins.count);
+        self.wait_for("no io_states have arrived", |status| {
+            let pins = status.pins?;
+            (pins.count >= seen + 2).then_some(pins.value.vacuum)
+        })
+        .await
+    }
+
+    /// Whether the goal was reached; `false` where the lag rule says that the object was pulled too hard. Without that rule an arm
+    /// that leaves its path may have met something: a fault, and the object stays held.
+    async fn reached(
+        &self,
+        name: &str,
+        status: GoalStatus,
+        code: i32,
+        reason: &str,
+    ) -> Result<bool, DriverError> {
+        let violated = code == FollowJointTrajectoryResult::PATH_TOLERANCE_VIOLATED;
+        if (status, code)
+            == (
+                GoalStatus::Succeeded,
+                FollowJointTrajectoryResult::SUCCESSFUL,
+            )
+        {
+            return Ok(true);
+        }
+        if violated && self.link.parameters.lag_rule {
+            return Ok(false);
+        }
+        let what = if violated {
+            " (path tolerance violated: something may be in the way)"
+        } else {
+            ""
+        };
+        let reason = if reason.is_empty() {
+            "no reason given"
+        } else {
+            reason
+        };
+        // Why the robot has stopped is the better reason.
+        let fault = DriverError::Fault(match self.link.obstacle() {
+            Some(obstacle) => format!("{obstacle}; {name} ended as {status:?}: {reason}"),
+            None => format!("{name} ended as {status:?} with error code {code}{what}: {reason}"),
+        });
+        Err(self.link.break_off(fault).await)
+    }
+
+    async fn move_along(&self, trajectory: &JointTrajectory) -> Result<bool, DriverError> {
+        self.ready().await?;
+        let (link, parameters) = (&self.link, &self.link.parameters);
+        let goal = FollowJointTrajectoryGoal {
+            trajectory: link.trajectory(trajectory)?,
+            path_tolerance: link.tolerances(parameters.path_tolerance_rad),
+            goal_tolerance: link.tolerances(parameters.goal_tolerance_rad),
+            ..Default::default()
+        };
+        let motion = link.carry_out(&link.follow, goal, trajectory.duration(), &self.stop);
+        let (status, result) = motion.await?;
+        let name = link.follow.name();
+        self.reached(name, status, result.error_code, &result.error_string)
+            .await
+    }
+
+    /// The driver's own way: an action that stops the arm at contact.
+    async fn move_until_contact(&self, trajectory: &JointTrajectory) -> Result<bool, DriverError> {
+        self.ready().await?;
+        let (link, parameters) = (&self.link, &self.link.parameters);
+        let goal = FollowJointTrajectoryUntilGoal {
+            trajectory: link.trajectory(trajectory)?,
+            path_tolerance: link.tolerances(parameters.path_tolerance_rad),
+            goal_tolerance: link.tolerances(parameters.goal_tolerance_rad),
+            until_type: FollowJointTrajectoryUntilGoal::TOOL_CONTACT,
+            ..Default::default()
+        };
+        let motion = link.carry_out(&link.until, goal, trajectory.duration(), &self.stop);
+        let (status, result) = motion.await?;
+        let name = link.until.name();
+        let reached = self
+            .reached(name, status, result.error_code, &result.error_string)
+            .await?;
+        let triggered =
+            result.until_condition_result == FollowJointTrajectoryUntilResult::TRIGGERED;
+        Ok(reached && triggered)
+    }
+
+    /// Suction is on while the tip comes down, and vacuum is the sign of contact. Where something is held already, there is no sign:
+    /// the end of the way is where it is put down.
+    async fn move_until_vacuum(&self, trajectory: &JointTrajectory) -> Result<bool, DriverError> {
+        let parameters = &self.link.parameters;
+        if self.read_vacuum().await? {
+            return self.move_along(trajectory).await.map(|_| false);
+        }
+        self.ready().await?;
+        self.switch_pin(parameters.suction_pin, true).await?;
+        let motion = self.move_along(trajectory);
+        tokio::pin!(motion);
+        let mut status = self.link.status.clone();
+        let held = async {
+            while !status
+                .borrow_and_update()
+                .pins
+                .is_some_and(|pins| pins.value.vacuum)
+            {
+                if status.changed().await.is_err() {
+                    std::future::pending::<()>().await;
+                }
+            }
+        };
+        let touched = tokio::select! {
+            ended = &mut motion => {
+                ended?;
+                // Vacuum takes time.
+                self.vacuum_within(parameters.grasp_wait_s, true).await?
+            }
+            () = held => {
+                self.link.stop_arm().await.map_err(DriverError::Fault)?;
+                self.check()?;
+                true
+            }
+        };
+        if !touched {
+            self.switch_pin(parameters.suction_pin, false).await?;
+        }
+        Ok(touched)
+    }
+
+    fn leave(&mut self) {
+        self.left = self.stamps.map(|(_, last)| last);
+    }
+}
+
+impl Robot for DriverRobot {
+    type Error = DriverError;
+
+    fn joints(&mut self) -> Result<Joints, DriverError> {
+        let runtime = self.runtime.clone();
+        runtime.block_on(self.read_joints())
+    }
+
+    fn follow(&mut self, trajectory: &JointTrajectory) -> Result<bool, DriverError> {
+        self.leave();
+        let runtime = self.runtime.clone();
+        runtime.block_on(self.move_along(trajectory))
+    }
+
+    fn follow_until_contact(&mut self, trajectory: &JointTrajectory) -> Result<bool, DriverError> {
+        self.leave();
+        let runtime = self.runtime.clone();
+        match self.link.parameters.contact {
+            ContactSign::UntilAction => runtime.block_on(self.move_until_contact(trajectory)),
+            ContactSign::Vacuum => runtime.block_on(self.move_until_vacuum(trajectory)),
+            // Where the surface is known, the end of the way is the contact.
+            ContactSign::Height => runtime.block_on(self.move_along(trajectory)),
+        }
+    }
+
+    fn set_suction(&mut self, on: bool) -> Result<(), DriverError> {
+        self.runtime.block_on(self.switch_suction(on))
+    }
+
+    fn holds(&mut self) -> Result<bool, DriverError> {
+        self.runtime.block_on(self.read_vacuum())
+    }
+}

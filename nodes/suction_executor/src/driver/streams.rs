@@ -1,0 +1,83 @@
+//! The driver's topics, as a status.
+
+use std::time::Instant;
+
+use msgs::convert;
+use msgs::sensor_msgs::JointState;
+use msgs::std_msgs::Bool;
+use msgs::ur_dashboard_msgs::{RobotMode, SafetyMode};
+use msgs::ur_msgs::{Digital, IOStates};
+use node_kit::{Node, Qos, TaskGroup};
+use tokio::sync::watch;
+use ur5::WorkCell;
+
+use crate::parameters::Driver;
+use crate::status::{DriverStatus, Pins, StillRule};
+
+/// Joints move less than this from one reading to the next while they stand still: the noise of encoders of 2e-5 rad.
+const STILL_STEP_RAD: f64 = 2e-4;
+
+/// Keeps the newest status of the driver, also while a motion is stopped because the node ends.
+pub(crate) fn follow_status(
+    node: &Node,
+    tasks: &TaskGroup,
+    driver: &Driver,
+    work_cell: &WorkCell,
+    origin: Instant,
+) -> anyhow::Result<watch::Receiver<DriverStatus>> {
+    let topic = |name| format!("{}/{name}", driver.io_and_status);
+    let mut joint_states = node.subscription::<JointState>("joint_states", Qos::Event)?;
+    let mut io_states = node.subscription::<IOStates>(&topic("io_states"), Qos::Event)?;
+    let mut robot_modes = node.subscription::<RobotMode>(&topic("robot_mode"), Qos::Latched)?;
+    let mut safety_modes = node.subscription::<SafetyMode>(&topic("safety_mode"), Qos::Latched)?;
+    let mut running = node.subscription::<Bool>(&topic("robot_program_running"), Qos::Latched)?;
+    let joint_names = work_cell.joint_names.clone();
+    let (suction_pin, vacuum_pin) = (driver.suction_pin, driver.vacuum_pin);
+    let rule = StillRule {
+        speed_rad_s: driver.rest_speed_rad_s,
+        step_rad: STILL_STEP_RAD,
+        home_rad: work_cell.arm.home,
+    };
+    let (sender, receiver) = watch::channel(DriverStatus::default());
+    tasks.spawn(async move {
+        loop {
+            tokio::select! {
+                message = joint_states.recv() => match convert::joint_reading_from_msg(&message, &joint_names) {
+                    Ok(reading) => sender.send_modify(|status| {
+                        status.read_joints(reading, origin.elapsed(), &rule);
+                    }),
+                    Err(error) => joint_states.reject(error),
+                },
+                message = io_states.recv() => {
+                    let suction = level(&message.digital_out_states, suction_pin);
+                    let vacuum = level(&message.digital_in_states, vacuum_pin);
+                    match (suction, vacuum) {
+                        (Some(suction), Some(vacuum)) => sender.send_modify(|status| {
+                            status.read_pins(Pins { suction, vacuum }, origin.elapsed());
+                        }),
+                        _ => io_states.reject(format_args!(
+                            "expected digital_out_states of pin {suction_pin} and digital_in_states of pin {vacuum_pin}"
+                        )),
+                    }
+                }
+                message = robot_modes.recv() => {
+                    sender.send_modify(|status| status.robot_mode = Some(message.mode));
+                }
+                message = safety_modes.recv() => {
+                    sender.send_modify(|status| status.safety_mode = Some(message.mode));
+                }
+                message = running.recv() => {
+                    sender.send_modify(|status| status.program_running = Some(message.data));
+                }
+            }
+        }
+    });
+    Ok(receiver)
+}
+
+fn level(states: &[Digital], pin: u8) -> Option<bool> {
+    states
+        .iter()
+        .find(|state| state.pin == pin)
+        .map(|state| state.state)
+}

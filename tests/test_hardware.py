@@ -1,0 +1,226 @@
+"""A cell whose driver behaves as a real one: late answers, servo lag, vacuum that takes time, processes that die."""
+
+from __future__ import annotations
+
+import pathlib
+import signal
+import time
+
+import numpy as np
+import pytest
+from cell_operator import Operator
+from processes import REPOSITORY
+from sctn_msgs.msg import Heightmap, PickPlace, StepConfirmation, StepResult
+from test_refusals import Cell
+
+REALISTIC = REPOSITORY / "config/hardware/realistic.yaml"
+DISKS = 9
+# Each step may be tried again a few times: the policy is learned.
+MOST_PROPOSALS = 3 * DISKS
+# The way of a cancel and the braking of the arm, which takes 0.15 s.
+REST_AFTER_STOP_S = 0.4
+# The same after the watchdog's timeout.
+REST_AFTER_DEATH_S = 0.6
+
+
+def parameters(node: str, **values: object) -> list[object]:
+    """The arguments of a node of the realistic cell."""
+    arguments: list[object] = ["--ros-args", "--params-file", REPOSITORY / f"config/{node}.yaml", "--params-file", REALISTIC]
+    for name, value in values.items():
+        arguments += ["-p", f"{name.replace('__', '.')}:={value}"]
+    return arguments
+
+
+@pytest.fixture
+def cell(start, operator: Operator) -> Cell:
+    """Simulated cell and executor; the test plays everybody else."""
+    start("sim_workcell", *parameters("sim_workcell", seed=10000))
+    cell = Cell(operator)
+    cell.executor = start("suction_executor", *parameters("suction_executor"))
+    cell.wait_until_ready()
+    return cell
+
+
+def propose(cell: Cell) -> PickPlace:
+    """A proposal from a heightmap of now, in which the table is there: black at height 0 is what no camera has seen."""
+
+    def look(heightmap: Heightmap) -> None:
+        heightmap.rgb = np.full(len(heightmap.rgb), 90, dtype=np.uint8)
+        heightmap.header.stamp = cell.operator.newest("joint_states").header.stamp
+
+    return cell.propose(cell.observe(look))
+
+
+def wait_until_moving(cell: Cell) -> None:
+    """The arm has left its place."""
+    before = np.array(cell.operator.newest("joint_states").position)
+    cell.operator.until(lambda: np.abs(np.array(cell.operator.newest("joint_states").position) - before).max() > 0.1, "motion", 30.0)
+
+
+def rest_after(cell: Cell, seconds: float) -> float:
+    """Watches the arm for some time, and returns after how much of it nothing moved any more [s]."""
+    begin = time.monotonic()
+    moved = 0.0
+    last = np.array(cell.operator.newest("joint_states").position)
+    while time.monotonic() - begin < seconds:
+        cell.operator.spin(0.02)
+        now = np.array(cell.operator.newest("joint_states").position)
+        if np.abs(now - last).max() > 5e-4:
+            moved = time.monotonic() - begin
+        last = now
+    return moved
+
+
+def seconds_in_motion(cell: Cell, seconds: float) -> float:
+    """Watches the arm for some time, and returns for how much of it something moved [s]."""
+    moved = 0.0
+    begin = before = time.monotonic()
+    last = np.array(cell.operator.newest("joint_states").position)
+    while before - begin < seconds:
+        cell.operator.spin(0.02)
+        now = np.array(cell.operator.newest("joint_states").position)
+        after = time.monotonic()
+        if np.abs(now - last).max() > 5e-4:
+            moved += after - before
+        last, before = now, after
+    return moved
+
+
+def start_watchdog(cell: Cell, start) -> None:
+    """The watchdog, once it hears the executor."""
+    start("motion_watchdog", "--ros-args", "--params-file", REPOSITORY / "config/motion_watchdog.yaml")
+    cell.operator.until(lambda: "motion_watchdog" in cell.operator.node.get_node_names(), "watchdog", 30.0)
+    cell.operator.spin(1.0)
+
+
+def test_an_executor_that_is_told_to_end_in_mid_motion_stops_the_arm_first(cell: Cell) -> None:
+    # There is no watchdog: the executor does it itself.
+    after = cell.operator.count("step_result")
+    proposal = propose(cell)
+    cell.operator.confirm(proposal.id, StepConfirmation.APPROVE)
+    wait_until_moving(cell)
+    cell.executor.signal(signal.SIGTERM)
+    moved_s = rest_after(cell, 3.0)
+    print(f"the arm came to rest {moved_s:.2f} s after SIGTERM")
+    assert moved_s < REST_AFTER_STOP_S
+    result = cell.operator.next("step_result", after, lambda result: result.proposal_id == proposal.id)
+    assert result.outcome == StepResult.STOPPED, result
+    assert cell.executor.wait(5.0) == 0
+
+
+def test_an_executor_that_ends_while_a_goal_is_unanswered_leaves_its_cancelling_to_the_watchdog(cell: Cell, start) -> None:
+    start_watchdog(cell, start)
+    proposal = propose(cell)
+    cell.operator.confirm(proposal.id, StepConfirmation.APPROVE)
+    wait_until_moving(cell)
+    # Over the pick: the descent is asked for, and is answered a second or two later.
+    cell.operator.until(lambda: rest_after(cell, 0.4) == 0.0, "end of the approach", 60.0)
+    cell.executor.signal(signal.SIGKILL)
+    # It is accepted when the executor is long gone, and cancelled at once.
+    moved_s = seconds_in_motion(cell, 4.0)
+    print(f"the arm moved for {moved_s:.2f} s")
+    assert moved_s < REST_AFTER_STOP_S
+
+
+def test_an_executor_that_is_killed_in_mid_motion_does_not_leave_the_arm_moving(cell: Cell, start) -> None:
+    start_watchdog(cell, start)
+    proposal = propose(cell)
+    cell.operator.confirm(proposal.id, StepConfirmation.APPROVE)
+    wait_until_moving(cell)
+    cell.executor.signal(signal.SIGKILL)
+    moved_s = rest_after(cell, 3.0)
+    print(f"the arm came to rest {moved_s:.2f} s after the executor was killed")
+    assert moved_s < REST_AFTER_DEATH_S
+
+
+def test_a_stop_during_an_unanswered_descent_keeps_the_arm_where_it_is(cell: Cell) -> None:
+    proposal = propose(cell)
+    after = cell.operator.count("step_result")
+    cell.operator.confirm(proposal.id, StepConfirmation.APPROVE)
+    wait_until_moving(cell)
+    # Over the pick: the descent is asked for, and is answered a second or two later.
+    cell.operator.until(lambda: rest_after(cell, 0.4) == 0.0, "end of the approach", 60.0)
+    said = time.monotonic()
+    cell.operator.confirm(proposal.id, StepConfirmation.STOP)
+    result = cell.operator.next("step_result", after, lambda result: result.proposal_id == proposal.id)
+    took_s = time.monotonic() - said
+    assert result.outcome == StepResult.STOPPED, result
+    print(f"the stop was answered after {took_s:.2f} s")
+    assert took_s < 1.0
+    assert rest_after(cell, 3.0) < 0.1
+
+
+def test_a_heightmap_with_the_arm_in_view_is_no_ground_to_move_on(cell: Cell) -> None:
+    proposal = propose(cell)
+    after = cell.operator.count("step_result")
+    cell.operator.confirm(proposal.id, StepConfirmation.APPROVE)
+    wait_until_moving(cell)
+    cell.operator.confirm(proposal.id, StepConfirmation.STOP)
+    stopped = cell.operator.next("step_result", after, lambda result: result.proposal_id == proposal.id)
+    assert stopped.outcome == StepResult.STOPPED, stopped
+    # Seen long after the end of the motion, by an arm at rest: only where it rests is wrong.
+    cell.operator.spin(1.0)
+    refused = cell.decide(propose(cell).id)
+    assert refused.outcome == StepResult.REFUSED
+    assert "the arm was not at home and at rest" in refused.reason
+    assert rest_after(cell, 1.0) == 0.0
+
+
+def test_an_arm_that_leaves_its_path_is_a_fault_and_stays_where_it_is(start, operator: Operator) -> None:
+    start("sim_workcell", *parameters("sim_workcell", seed=10000, hardware__servo_delay_s=0.5))
+    cell = Cell(operator)
+    start("suction_executor", *parameters("suction_executor"))
+    cell.wait_until_ready()
+    after = operator.count("step_result")
+    proposal = propose(cell)
+    operator.confirm(proposal.id, StepConfirmation.APPROVE)
+    result = operator.next("step_result", after, lambda result: result.proposal_id == proposal.id)
+    assert result.outcome == StepResult.FAULT, result
+    assert "path tolerance" in result.reason
+    assert rest_after(cell, 2.0) == 0.0
+
+
+def test_a_second_executor_does_not_become_active(cell: Cell, start) -> None:
+    second = start("suction_executor", *parameters("suction_executor"))
+    assert second.wait(30.0) != 0
+    assert "another executor is active" in second.errors()
+    # The first one works on.
+    cell.operator.confirm(propose(cell).id, StepConfirmation.APPROVE)
+    wait_until_moving(cell)
+
+
+def test_placing_completes_with_a_driver_as_it_is(start, operator: Operator, tmp_path: pathlib.Path) -> None:
+    demos = start("sctn", "demos", "--problem", "placing", "--episodes", 1, "--seed", 10000, "--out", tmp_path / "demos")
+    assert demos.wait(120.0) == 0, demos.log()
+    (demonstration,) = [file.parent for file in (tmp_path / "demos").rglob("metadata.yaml")]
+    start("sim_workcell", *parameters("sim_workcell", problem="placing", seed=10000))
+    start("camera_fusion", *parameters("camera_fusion"))
+    start("goal_oracle", *parameters("goal_oracle", demonstration=demonstration))
+    start("gctn_policy", *parameters("gctn_policy", checkpoint=REPOSITORY / "config/checkpoints/ten_problems.safetensors"))
+    start("suction_executor", *parameters("suction_executor"))
+    operator.listeners = 3
+    begin = time.monotonic()
+    outcomes: list[int] = []
+    seen = 0
+    for _ in range(MOST_PROPOSALS):
+        goal = operator.newest("goal") if operator.count("goal") > seen else operator.next("goal", seen)
+        seen = operator.count("goal")
+        wanted = (goal.step, goal.attempt)
+        operator.next("pick_place", accept=lambda made, wanted=wanted: (made.step, made.attempt) == wanted)
+        # Another view may have replaced it meanwhile.
+        operator.until(operator.executor_is_ready, "executor that is ready", 60.0)
+        proposal = operator.newest("pick_place")
+        rewards = operator.count("reward")
+        result = operator.approve(proposal)
+        if result.outcome == StepResult.REFUSED and "superseded" in result.reason:
+            seen -= 1
+            continue
+        outcomes.append(result.outcome)
+        assert result.outcome not in (StepResult.FAULT, StepResult.STOPPED, StepResult.REFUSED), result.reason
+        reward = operator.next("reward", rewards)
+        if reward.complete:
+            break
+        operator.confirm(proposal.id, StepConfirmation.ADVANCE if reward.delta > 0 else StepConfirmation.RETRY)
+    took_s = time.monotonic() - begin
+    print(f"placing: {len(outcomes)} motions in {took_s:.0f} s, total reward {operator.newest('reward').total:.3f}")
+    assert operator.newest("reward").complete

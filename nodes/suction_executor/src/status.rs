@@ -50,6 +50,8 @@ pub struct DriverStatus {
     pub program_running: Option<bool>,
     /// `joint_states`
     pub joints: Option<Newest<JointReading>>,
+    /// Arrival of the newest reading of the joints that came too long after the one before: this process or the driver stood still.
+    pub interrupted_at: Option<Duration>,
     /// Since when the joints have stood still.
     pub still: Option<Still>,
     /// Whether the arm is out of the cameras' view.
@@ -74,6 +76,8 @@ pub struct StillRule {
     pub speed_rad_s: f64,
     /// No joint moves further from one reading to the next.
     pub step_rad: f64,
+    /// Longest pause between two readings.
+    pub pause: Duration,
     /// Where the arm is out of the cameras' sight (rad).
     pub home_rad: Joints,
 }
@@ -86,6 +90,9 @@ impl DriverStatus {
             let step = reading.positions_rad - before.value.positions_rad;
             reading.velocities_rad_s.amax() <= rule.speed_rad_s && step.amax() <= rule.step_rad
         });
+        if before.is_some_and(|before| at.saturating_sub(before.at) > rule.pause) {
+            self.interrupted_at = Some(at);
+        }
         let in_time = before.is_some_and(|before| before.value.stamp == reading.stamp);
         let (positions, velocities) = (&reading.positions_rad, &reading.velocities_rad_s);
         self.at_home
@@ -193,6 +200,7 @@ pub(crate) mod tests {
                 count: 1,
             }),
             still: None,
+            interrupted_at: None,
             at_home: AtHome::default(),
             pins: Some(Newest {
                 value: Pins::default(),
@@ -306,6 +314,7 @@ pub(crate) mod tests {
         let rule = StillRule {
             speed_rad_s: 1e-3,
             step_rad: 1e-4,
+            pause: AGE,
             home_rad: Joints::repeat(1.1),
         };
         let mut status = DriverStatus::default();
@@ -329,6 +338,10 @@ pub(crate) mod tests {
         assert_eq!(read(6, 132, 1.1, 0.0), Some((6, true)));
         let _ = read(7, 140, 1.1, 0.0);
         assert_eq!(status.joints.unwrap().count, 8);
+        assert_eq!(status.interrupted_at, None);
+        let late = status.joints.unwrap().value;
+        status.read_joints(late, Duration::from_millis(1008), &rule);
+        assert_eq!(status.interrupted_at, Some(Duration::from_millis(1008)));
         // At home since the first slow reading there.
         assert!(!status.at_home.may_be_in_view(Duration::from_millis(132)));
         assert!(status.at_home.may_be_in_view(Duration::from_millis(131)));

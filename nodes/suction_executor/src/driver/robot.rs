@@ -25,6 +25,8 @@ pub(crate) struct DriverRobot {
     link: Arc<Link>,
     runtime: Handle,
     stop: CancellationToken,
+    /// When the primitive began, as the times of arrival in the status.
+    begun: Duration,
     /// Stamp of the joint reading before the motion whose end has not been read yet.
     left: Option<Duration>,
     /// Stamps of the first and the last joint reading.
@@ -34,6 +36,7 @@ pub(crate) struct DriverRobot {
 impl DriverRobot {
     pub(crate) fn new(link: Arc<Link>, runtime: Handle, stop: CancellationToken) -> Self {
         Self {
+            begun: link.origin.elapsed(),
             link,
             runtime,
             stop,
@@ -47,8 +50,17 @@ impl DriverRobot {
         if self.stop.is_cancelled() {
             return Err(DriverError::Stopped);
         }
-        let obstacle = self.link.obstacle();
-        obstacle.map_or(Ok(()), |obstacle| Err(DriverError::Fault(obstacle)))
+        if let Some(obstacle) = self.link.obstacle() {
+            return Err(DriverError::Fault(obstacle));
+        }
+        let interrupted_at = self.link.status.borrow().interrupted_at;
+        if interrupted_at.is_some_and(|at| at > self.begun) {
+            return Err(DriverError::Fault(format!(
+                "joint_states were interrupted for more than {:.1} s since the motion began: this process or the driver stood still",
+                self.link.parameters.status_max_age_s
+            )));
+        }
+        Ok(())
     }
 
     /// Refuses to go on with a driver that lacks something, or whose answer to an earlier goal is still to come. Soon after the start the

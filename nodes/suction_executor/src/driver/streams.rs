@@ -1,6 +1,6 @@
 //! The driver's topics, as a status.
 
-use std::time::Instant;
+use std::time::{Duration, Instant};
 
 use msgs::convert;
 use msgs::sensor_msgs::JointState;
@@ -36,6 +36,7 @@ pub(crate) fn follow_status(
     let rule = StillRule {
         speed_rad_s: driver.rest_speed_rad_s,
         step_rad: STILL_STEP_RAD,
+        pause: Duration::from_secs_f64(driver.status_max_age_s),
         home_rad: work_cell.arm.home,
     };
     let (sender, receiver) = watch::channel(DriverStatus::default());

@@ -1,5 +1,6 @@
 //! Set-up, demonstration run and tests of the whole repository: `cargo xtask --help`.
 
+mod campaign;
 mod check;
 mod command;
 mod demo;
@@ -55,6 +56,18 @@ enum Task {
         #[arg(long, default_value_t = 10_000)]
         seed: u64,
     },
+    /// Inject faults at random moments of motions, while an independent monitor reads the joints and the approvals
+    Campaign {
+        /// How many faults; each has a cell of its own and takes some 10 s
+        #[arg(long, default_value_t = 20)]
+        faults: u32,
+        /// The same seed draws the same faults at the same moments
+        #[arg(long, default_value_t = 1)]
+        seed: u64,
+        /// Print the result as one line of JSON
+        #[arg(long)]
+        json: bool,
+    },
     /// Check that every dependency has a permissive licence
     Licences,
 }
@@ -71,6 +84,7 @@ fn main() -> Result<()> {
         Task::Check { packages } => check::run_checks(&packages),
         Task::Test { only, pytest } => stage::run_all(&only, &pytest),
         Task::Demo { problem, seed } => demo::run_problem(&problem, seed),
+        Task::Campaign { faults, seed, json } => campaign::run_faults(faults, seed, json),
         Task::Licences => licences::check(),
     }
 }

@@ -1,0 +1,76 @@
+"""The monitor of the fault campaign catches what it is for, and a short campaign finds nothing."""
+
+from __future__ import annotations
+
+import pytest
+from campaign import campaign
+from fault_monitor import Monitor
+
+FAULTS = 20
+SEED = 17
+
+
+@pytest.fixture
+def monitor() -> Monitor:
+    """A monitor that has seen proposal 2 replace proposal 1, and the arm at rest."""
+    monitor = Monitor("anna")
+    monitor.on_proposal(1)
+    monitor.on_proposal(2)
+    monitor.on_joints([0.0, 0.0], 0.0)
+    return monitor
+
+
+def move(monitor: Monitor, now: float) -> None:
+    """A reading of a moving arm."""
+    monitor.on_joints([now, 0.0], now)
+
+
+@pytest.mark.parametrize(("proposal_id", "operator"), [(1, "anna"), (3, "anna"), (2, "eve"), (None, "")])
+def test_the_monitor_catches_a_motion_that_the_deciding_operator_has_not_approved(
+    monitor: Monitor, proposal_id: int | None, operator: str
+) -> None:
+    if proposal_id is not None:
+        monitor.on_approval(proposal_id, operator)
+    move(monitor, 1.0)
+    assert monitor.violations == ["the arm moves without an approval at 1.000 s"]
+
+
+def test_the_monitor_catches_a_motion_that_goes_on_after_a_stop(monitor: Monitor) -> None:
+    monitor.on_approval(2, "anna")
+    move(monitor, 1.0)
+    monitor.on_stop(1.1, 0.3)
+    move(monitor, 1.4)
+    assert not monitor.violations
+    move(monitor, 1.6)
+    assert "0.50 s after it had to stop" in monitor.violations[0]
+
+
+def test_the_monitor_catches_a_second_motion_on_the_same_approval(monitor: Monitor) -> None:
+    monitor.on_approval(2, "anna")
+    move(monitor, 1.0)
+    monitor.on_end(2, 1.1)
+    monitor.on_approval(2, "anna")
+    move(monitor, 1.3)
+    assert monitor.violations
+
+
+def test_the_monitor_lets_an_approved_motion_and_the_noise_of_an_arm_at_rest_pass(monitor: Monitor) -> None:
+    monitor.on_joints([1e-4, 0.0], 0.5)
+    monitor.on_approval(2, "anna")
+    move(monitor, 1.0)
+    # The next proposal does not take the approval away.
+    monitor.on_proposal(3)
+    move(monitor, 2.0)
+    monitor.on_end(2, 2.1)
+    monitor.on_joints([2.0, 1e-4], 3.0)
+    monitor.on_approval(3, "anna")
+    move(monitor, 4.0)
+    assert not monitor.violations
+
+
+def test_a_short_campaign_finds_no_unapproved_motion_none_after_a_stop_and_no_hung_run() -> None:
+    result = campaign(FAULTS, SEED)
+    print(result)
+    assert result["violations"] == []
+    assert result["hung_runs"] == 0
+    assert result["resumed"] + result["refused"] == FAULTS

@@ -107,6 +107,32 @@ def test_a_person_rejects_once_and_then_approves_a_run_of_stacking_to_its_end_by
     ada.page.keyboard.press("Enter")
     ada.reads("Step 1 of 6: the policy proposes")
     ada.can("Approve")
+    # What is proposed is seen from everywhere before it is approved.
+    expect(ada.page.get_by_text(re.compile("Made by gctn_policy with ten_problems"))).to_be_visible()
+    expect(ada.page.get_by_text(re.compile(r"The planned motion takes \d"))).to_be_visible()
+    slider = ada.page.get_by_role("slider", name="Time")
+    robot = ada.page.get_by_role("img", name="The robot in its cell")
+    drawn = []
+    for share in (0.0, 0.5):
+        slider.evaluate("(slider, share) => { slider.value = share * slider.max; slider.dispatchEvent(new Event('input')); }", share)
+        drawn.append(robot.evaluate("canvas => canvas.toDataURL()"))
+    assert drawn[0] != drawn[1]
+    ada.page.keyboard.press("p")
+    ada.button("Pause").click()
+    ada.page.get_by_role("heading", name="Camera views").click()
+    views = [ada.page.get_by_role("img", name=f"What the {name} camera sees") for name in ("front", "left", "right")]
+    for view in views:
+        expect(view).to_be_visible()
+        # The place is marked in its colour.
+        count = "c => { const d = c.getContext('2d').getImageData(0, 0, c.width, c.height).data; let n = 0; "
+        count += "for (let i = 0; i < d.length; i += 4) n += d[i] === 92 && d[i + 1] === 214 && d[i + 2] === 192; return n; }"
+        until(lambda view=view, count=count: view.evaluate(count) > 20, "mark on a camera's image", 20.0)
+    ada.page.get_by_role("heading", name="Camera views").click()
+    table = ada.page.get_by_role("img", name="The table now, from above")
+    seen = table.evaluate("canvas => canvas.toDataURL()")
+    ada.page.get_by_label("Place scores").check()
+    until(lambda: table.evaluate("canvas => canvas.toDataURL()") != seen, "scores", 20.0)
+    ada.page.get_by_label("Colour").check()
     ada.finds_no_barrier()
     ada.page.keyboard.press("r")
     ada.reads("Step 1 of 6, attempt 2")
@@ -194,6 +220,7 @@ def test_a_motion_is_stopped_and_the_run_goes_on_and_a_second_browser_takes_over
     proposals = operator.count("pick_place")
     bob.button("Propose this").click()
     corrected = operator.next("pick_place", proposals)
+    assert (corrected.author, corrected.checkpoint) == ("Bob", "")
     assert round(1000 * corrected.place.x) == int(place_x.input_value())
     bob.can("Approve")
     bob.button("Approve").click()
@@ -245,7 +272,9 @@ def test_a_task_is_taught_by_clicks_saved_and_repeated(browser: Browser, start, 
     ada.finds_no_barrier()
 
     def click(x_m: float, y_m: float) -> None:
-        box = ada.page.get_by_role("img", name="The table now, from above").bounding_box()
+        table = ada.page.get_by_role("img", name="The table now, from above")
+        table.scroll_into_view_if_needed()
+        box = table.bounding_box()
         # The robot looks up: x up, y to the left.
         ada.page.mouse.click(box["x"] + (0.5 - y_m) * box["width"], box["y"] + (0.75 - x_m) / 0.5 * box["height"])
 
@@ -270,6 +299,9 @@ def test_a_task_is_taught_by_clicks_saved_and_repeated(browser: Browser, start, 
     ada.page.get_by_label("Name of the task").fill("one_block")
     ada.button("Save").click()
     expect(ada.page.get_by_text("Saved as one_block.")).to_be_visible()
+    ada.page.get_by_label("Name of the task").fill("held_back")
+    ada.button("Save").click()
+    expect(ada.page.get_by_text("Saved as held_back.")).to_be_visible()
     ada.button("End the lesson").click()
 
     goals = operator.count("goal")
@@ -277,6 +309,25 @@ def test_a_task_is_taught_by_clicks_saved_and_repeated(browser: Browser, start, 
     goal = operator.next("goal", goals)
     assert (goal.problem, goal.step, goal.step_count) == ("one_block", 1, 1)
     ada.reads("Step 1 of 1")
+
+    # A policy learns from the one task, is compared on the other, and is used while the graph is at work.
+    ada.page.get_by_role("combobox", name="one_block").select_option("learn from")
+    ada.page.get_by_role("combobox", name="held_back").select_option("hold out")
+    ada.page.get_by_label("Name of the policy").fill("taught")
+    ada.page.get_by_role("spinbutton", name="Steps").fill("2")
+    ada.button("Train").click()
+    expect(ada.page.get_by_text("taught is trained.")).to_be_visible()
+    compared = ada.page.get_by_role("table", name="Median distance from 1 held-out step")
+    expect(compared.get_by_role("row", name=re.compile(r"taught [0-9.]+ mm [0-9.]+ mm [0-9.]+°"))).to_be_visible()
+    ada.finds_no_barrier()
+    ada.page.get_by_role("combobox", name="Checkpoint").select_option("taught")
+    ada.button("Use this checkpoint").click()
+    expect(ada.button("Go back to ten_problems")).to_be_visible()
+    ada.can("Reject")
+    operator.spin(0.5)
+    proposals = operator.count("pick_place")
+    ada.button("Reject").click()
+    assert operator.next("pick_place", proposals).checkpoint == "taught"
     ada.close()
 
 
@@ -291,6 +342,15 @@ def test_a_program_approves_a_step_and_is_refused_what_is_stale(start, decided) 
     assert (rows, cols, len(colors), len(heights_m)) == (320, 160, 3 * 320 * 160, 320 * 160)
     assert 0.01 < max(heights_m) < 0.3
     until(lambda: "approve" not in console.state()["refused"], "fresh streams", 30.0)
+    assert (first["proposal"]["author"], first["proposal"]["checkpoint"]) == ("gctn_policy", "ten_problems")
+    motion = json.loads(console._request("motion")[0])
+    assert motion["proposal_id"] == first["proposal"]["id"] and len(motion["joint_names"]) == 6
+    assert 0 < motion["suction_on_s"] < motion["suction_off_s"] < motion["times_s"][-1] == first["motion"]["duration_s"]
+    # The policy is given another checkpoint while the graph is at work.
+    with pytest.raises(CLIENT.Refused, match="no checkpoint"):
+        console.post("checkpoints/use", name="none_of_these")
+    console.post("checkpoints/use", name="any_start")
+    until(lambda: console.state()["policy"], "other checkpoint", 30.0)
     console.decide("reject", first["proposal"])
     second = until(
         lambda: (state := console.state())["phase"] == "proposed" and state["proposal"]["id"] != first["proposal"]["id"] and state,
@@ -299,6 +359,10 @@ def test_a_program_approves_a_step_and_is_refused_what_is_stale(start, decided) 
     )
     with pytest.raises(CLIENT.Refused, match="is not the present one"):
         console.decide("approve", first["proposal"])
+    assert second["proposal"]["checkpoint"] == "any_start"
+    console.post("checkpoints/back")
+    until(lambda: console.state()["policy"]["checkpoint"].endswith("ten_problems.safetensors"), "checkpoint from before", 30.0)
+    until(lambda: "approve" not in console.state()["refused"], "fresh streams", 30.0)
     console.decide("approve", second["proposal"])
     # Replayed: nothing happens twice.
     with pytest.raises(CLIENT.Refused):

@@ -5,6 +5,7 @@ mod bench;
 mod calibrate;
 mod camera_stream;
 mod check;
+mod compare;
 mod console;
 mod curves;
 mod decide;
@@ -62,6 +63,8 @@ enum Command {
     Interfaces(interfaces::Interfaces),
     /// Train a policy on demonstrations, by a recipe
     Train(train::Train),
+    /// Measure how far policies are from demonstrated steps that they were not trained on
+    Compare(compare::Compare),
     /// Train and test many policies: problems, agents, demonstrations and seeds
     Sweep(sweep::SweepCommand),
     /// Find the step weights of a task module, and how complex it is, by black-box optimisation
@@ -105,6 +108,7 @@ fn main() -> Result<ExitCode> {
         Command::Health(health) => health.run(&root()?),
         Command::Interfaces(interfaces) => interfaces.run(&root()?),
         Command::Train(train) => train.run(&root()?),
+        Command::Compare(compare) => compare.run(&root()?),
         Command::Sweep(sweep) => sweep.run(&root()?),
         Command::Search(search) => search.run(&root()?),
         Command::Embed(embed) => embed.run(&root()?),

@@ -18,7 +18,7 @@ use std::io::Write;
 use std::path::{Path, PathBuf};
 
 /// Gradient steps between lines of progress where there is no terminal.
-const LOG_EVERY: u64 = 50;
+const LOG_EVERY: u64 = 10;
 
 /// Gradient steps between scalars for TensorBoard.
 const EVENT_EVERY: u64 = 10;
@@ -36,6 +36,15 @@ pub struct Train {
     /// Folder for state, snapshots and the policy
     #[arg(long)]
     out: PathBuf,
+    /// Problems in place of the recipe's
+    #[arg(long, num_args = 1..)]
+    problems: Vec<String>,
+    /// Gradient steps in place of the recipe's
+    #[arg(long)]
+    steps: Option<u64>,
+    /// Checkpoint to begin with in place of the recipe's; its network is used
+    #[arg(long)]
+    start_from: Option<PathBuf>,
     /// Go on with the training in that folder
     #[arg(long)]
     resume: bool,
@@ -70,7 +79,20 @@ impl Snapshot {
 
 impl Train {
     pub fn run(self, root: &Root) -> Result<()> {
-        let recipe = Recipe::load(&self.recipe)?;
+        let mut recipe = Recipe::load(&self.recipe)?;
+        if !self.problems.is_empty() {
+            recipe.problems.clone_from(&self.problems);
+        }
+        if let Some(steps) = self.steps {
+            recipe.training.steps = steps;
+        }
+        if let Some(checkpoint) = self.start_from {
+            recipe.network = Policy::load(&checkpoint)
+                .with_context(|| format!("--start-from {}", checkpoint.display()))?
+                .config()
+                .clone();
+            recipe.start_from = Some(checkpoint);
+        }
         let average = recipe.average as usize;
         let snapshots = train(root, recipe, &self.demos, &self.out, self.resume)?;
         let best = snapshots.iter().max_by(|a, b| {

@@ -40,6 +40,10 @@ pub struct Console {
     pub address_file: PathBuf,
     /// Folder of the demonstrations that can be repeated.
     pub library: PathBuf,
+    /// This command, by which it trains.
+    pub program: PathBuf,
+    /// Folder of what is trained.
+    pub training: PathBuf,
 }
 
 /// In the order in which they go to work: the first goal comes when all others are there.
@@ -94,6 +98,11 @@ impl Settings {
                     ("address_file", path(&console.address_file)),
                     ("demonstration", path(&self.demonstration)),
                     ("library", path(&console.library)),
+                    ("checkpoints", path(&root.join("config/checkpoints"))),
+                    ("checkpoint", path(&self.checkpoint)),
+                    ("recipe", path(&root.join("config/recipes/taught.yaml"))),
+                    ("sctn", path(&console.program)),
+                    ("training", path(&console.training)),
                 ],
                 None => Vec::new(),
             },

@@ -174,6 +174,8 @@ impl Launch {
                 OperatorKind::Web => Some(graph::Console {
                     address_file: std::path::absolute(temporary.path().join("console"))?,
                     library: std::path::absolute(&self.library)?,
+                    program: std::env::current_exe().context("path of the program")?,
+                    training: std::path::absolute(self.library.with_file_name("training"))?,
                 }),
                 _ => None,
             },

@@ -7,7 +7,8 @@ use bags::Qos;
 use msgs::Interface;
 use msgs::rosgraph_msgs::Clock;
 use msgs::sctn_msgs::{
-    ConfirmationRefused, Goal, Heightmap, PickPlace, Reward, StepConfirmation, StepResult,
+    ConfirmationRefused, Goal, Heightmap, PickPlace, PlannedMotion, Reward, StepConfirmation,
+    StepResult,
 };
 use msgs::sensor_msgs::{CameraInfo, Image, JointState};
 use msgs::tf2_msgs::TFMessage;
@@ -24,10 +25,11 @@ const DISCOVERY: Duration = Duration::from_secs(20);
 /// How long what shows the end of the run may take: images are best effort, and said again twice a second.
 pub const LAST_HEIGHTMAP: Duration = Duration::from_secs(20);
 
-const TOPICS: [(&str, &str, Qos); 10] = [
+const TOPICS: [(&str, &str, Qos); 11] = [
     ("heightmap", Heightmap::TYPE_NAME, Qos::LATCHED),
     ("goal", Goal::TYPE_NAME, Qos::LATCHED),
     ("pick_place", PickPlace::TYPE_NAME, Qos::LATCHED),
+    ("planned_motion", PlannedMotion::TYPE_NAME, Qos::LATCHED),
     (
         "step_confirmation",
         StepConfirmation::TYPE_NAME,

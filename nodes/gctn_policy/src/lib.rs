@@ -8,6 +8,7 @@ mod parameters;
 mod picture;
 
 use std::{
+    path::{Path, PathBuf},
     sync::{Arc, Mutex, PoisonError},
     time::{Duration, Instant},
 };
@@ -17,11 +18,14 @@ use gctn::{Decision, GoalConditioning, Policy};
 use heightmap::ChangeRules;
 use msgs::{
     convert,
-    sctn_msgs::{Goal, Heightmap, PickPlace, StepConfirmation, StepResult},
+    sctn_msgs::{
+        Goal, Heightmap, LoadCheckpoint, LoadCheckpointRequest, LoadCheckpointResponse, PickPlace,
+        StepConfirmation, StepResult,
+    },
     sensor_msgs::Image,
     visualization_msgs::MarkerArray,
 };
-use node_kit::{Active, Level, Node, Publisher, Qos};
+use node_kit::{Active, Level, Node, Publisher, Qos, ReplyCache, RequestId};
 use step_protocol::{Job, PlannerRules, Prediction, Proposal, ProposalPlanner};
 use tokio::sync::mpsc;
 use tracing::{info, warn};
@@ -31,9 +35,17 @@ use arm_view::ArmView;
 pub use parameters::GctnPolicyParameters;
 pub use picture::{markers, score_image};
 
+/// A policy, and where it was read from.
+struct LoadedPolicy {
+    policy: Policy,
+    checkpoint: PathBuf,
+}
+
 /// What the network says to a job, and how long it took.
 struct Answer {
     job: Job,
+    /// Checkpoint that decided.
+    checkpoint: PathBuf,
     decision: Result<Decision, String>,
     took: Duration,
 }
@@ -49,37 +61,56 @@ pub async fn configure(node: Node, parameters: GctnPolicyParameters) -> anyhow::
         scores: node.publisher("pick_place/scores", Qos::Latched)?,
     };
     let threads = parameters.threads;
-    let shown = path.display().to_string();
+    let reading = path.clone();
     let policy = node
         .spawn_blocking(move || {
             gctn::set_threads(threads);
-            Policy::load(&path)
+            load(&reading)
         })
         .await
         .context("loading the checkpoint")?
         .context("parameter checkpoint")?;
+    info!("checkpoint {} loaded", path.display());
+    Ok(PolicyNode {
+        policy: Arc::new(Mutex::new(LoadedPolicy {
+            policy,
+            checkpoint: path.clone(),
+        })),
+        checkpoint: path,
+        loads: ReplyCache::default(),
+        outputs,
+    })
+}
+
+/// A policy that can follow the goals of the graph.
+fn load(path: &Path) -> anyhow::Result<Policy> {
+    let policy = Policy::load(path)?;
     let conditioning = policy.config().conditioning;
     if !matches!(
         conditioning,
         GoalConditioning::NextStep | GoalConditioning::Sequence
     ) {
         bail!(
-            "parameter checkpoint: {shown} is conditioned on {conditioning:?}, but the goals of the graph are next-step goals: \
-             expected a checkpoint trained with conditioning next_step or sequence"
+            "{} is conditioned on {conditioning:?}, but the goals of the graph are next-step goals: \
+             expected a checkpoint trained with conditioning next_step or sequence",
+            path.display()
         );
     }
-    info!("checkpoint {shown} loaded");
-    Ok(PolicyNode {
-        policy: Arc::new(Mutex::new(policy)),
-        outputs,
-    })
+    Ok(policy)
 }
 
 /// The configured node.
 pub struct PolicyNode {
-    policy: Arc<Mutex<Policy>>,
+    policy: Arc<Mutex<LoadedPolicy>>,
+    /// The checkpoint in use.
+    checkpoint: PathBuf,
+    /// Answers to calls of `load_checkpoint`.
+    loads: ReplyCache<LoadCheckpointResponse>,
     outputs: Outputs,
 }
+
+/// A call of `load_checkpoint`, and what came of reading it.
+type Loaded = (RequestId, LoadCheckpointRequest, anyhow::Result<()>);
 
 impl Active for PolicyNode {
     /// Begins anew: goal and heightmap are latched, so what is open is proposed again, under the same id.
@@ -91,8 +122,10 @@ impl Active for PolicyNode {
         let mut heightmaps = node.subscription::<Heightmap>("heightmap", Qos::Latched)?;
         // One job at a time: the planner gives the next when it has the answer.
         let (jobs, mut answers) = start_network(node, Arc::clone(&self.policy));
+        let mut load_calls = node.service_server::<LoadCheckpoint>("~/load_checkpoint")?;
+        let (loaded_sender, mut loaded) = mpsc::unbounded_channel::<Loaded>();
         let mut changes = node.parameters::<GctnPolicyParameters>();
-        let rules = rules_of(&changes.borrow_and_update(), node);
+        let rules = rules_of(&changes.borrow_and_update(), &self.checkpoint, node);
         let mut planner = ProposalPlanner::new(rules);
         let mut arm_view = ArmView::new(node, &changes.borrow())?;
         loop {
@@ -145,6 +178,8 @@ impl Active for PolicyNode {
                 },
                 answer = answers.recv() => {
                     let answer = answer.context("the network's thread has ended")?;
+                    // A checkpoint may have been loaded since.
+                    planner.set_rules(rules_of(&changes.borrow(), &answer.checkpoint, node));
                     let prediction = answer.decision.as_ref().map(prediction);
                     let prediction = prediction.as_ref().map_err(|reason| String::clone(reason));
                     let (proposal, job) = planner.on_prediction(prediction);
@@ -154,7 +189,46 @@ impl Active for PolicyNode {
                     job
                 }
                 Ok(()) = changes.changed() => {
-                    planner.set_rules(rules_of(&changes.borrow_and_update(), node));
+                    planner.set_rules(rules_of(&changes.borrow_and_update(), &self.checkpoint, node));
+                    None
+                }
+                (call, request) = load_calls.recv() => {
+                    let path = self.checkpoint.display().to_string();
+                    let refusal = |message| {
+                        warn!("load_checkpoint: {message}");
+                        LoadCheckpointResponse {
+                            success: false,
+                            message,
+                            path: path.clone(),
+                            previous: path,
+                        }
+                    };
+                    match self.loads.known(&request.request_id, refusal) {
+                        Some(answer) => load_calls.respond(call, answer),
+                        None => {
+                            let policy = Arc::clone(&self.policy);
+                            let sender = loaded_sender.clone();
+                            node.spawn_blocking(move || {
+                                let read = load(Path::new(&request.path));
+                                // What is being decided is decided first.
+                                let read = read.map(|read| {
+                                    let mut policy = policy.lock().unwrap_or_else(PoisonError::into_inner);
+                                    *policy = LoadedPolicy {
+                                        policy: read,
+                                        checkpoint: PathBuf::from(&request.path),
+                                    };
+                                });
+                                // Nobody waits where the node was deactivated meanwhile.
+                                let _ = sender.send((call, request, read));
+                            });
+                        }
+                    }
+                    None
+                }
+                Some((call, request, read)) = loaded.recv() => {
+                    let answer = self.answer_of_load(request.path, read);
+                    self.loads.remember(&request.request_id, answer.clone());
+                    load_calls.respond(call, answer);
                     None
                 }
             };
@@ -167,6 +241,30 @@ impl Active for PolicyNode {
     }
 }
 
+impl PolicyNode {
+    /// The answer to a call of `load_checkpoint`; where it was read, it is the one in use from now on.
+    fn answer_of_load(&mut self, path: String, read: anyhow::Result<()>) -> LoadCheckpointResponse {
+        let previous = self.checkpoint.display().to_string();
+        let (success, message) = match read {
+            Ok(()) => {
+                info!("checkpoint {path} loaded");
+                self.checkpoint = PathBuf::from(&path);
+                (true, format!("checkpoint {path} is in use"))
+            }
+            Err(error) => {
+                warn!("load_checkpoint: {error:#}");
+                (false, format!("{error:#}"))
+            }
+        };
+        LoadCheckpointResponse {
+            success,
+            message,
+            path: self.checkpoint.display().to_string(),
+            previous,
+        }
+    }
+}
+
 /// Decisions that are none concern the planner as little as those on a motion.
 fn confirm(planner: &mut ProposalPlanner, message: &StepConfirmation) {
     if let Ok(confirmation) = convert::confirmation_from_msg(message) {
@@ -174,8 +272,8 @@ fn confirm(planner: &mut ProposalPlanner, message: &StepConfirmation) {
     }
 }
 
-fn rules_of(parameters: &GctnPolicyParameters, node: &Node) -> PlannerRules {
-    let checkpoint = parameters.checkpoint.file_stem().unwrap_or_default();
+fn rules_of(parameters: &GctnPolicyParameters, checkpoint: &Path, node: &Node) -> PlannerRules {
+    let checkpoint = checkpoint.file_stem().unwrap_or_default();
     PlannerRules {
         changes: ChangeRules::new(
             parameters.observation_tolerance_m,
@@ -211,23 +309,26 @@ fn goal_for<'a>(policy: &Policy, job: &'a Job) -> Result<gctn::Goal<'a>, String>
 /// Decides on a thread of its own until the sender is dropped.
 fn start_network(
     node: &Node,
-    policy: Arc<Mutex<Policy>>,
+    policy: Arc<Mutex<LoadedPolicy>>,
 ) -> (mpsc::Sender<Job>, mpsc::Receiver<Answer>) {
     let (jobs, mut waiting) = mpsc::channel::<Job>(1);
     let (answers, answered) = mpsc::channel(1);
     node.spawn_blocking(move || {
         while let Some(job) = waiting.blocking_recv() {
             // Held by the thread of an earlier activation until its last decision is made.
-            let policy = policy.lock().unwrap_or_else(PoisonError::into_inner);
+            let loaded = policy.lock().unwrap_or_else(PoisonError::into_inner);
+            let LoadedPolicy { policy, checkpoint } = &*loaded;
             let start = Instant::now();
-            let decision = goal_for(&policy, &job).and_then(|goal| {
+            let decision = goal_for(policy, &job).and_then(|goal| {
                 let decision = policy.decide(&job.observation, goal, &job.exclude);
                 decision.map_err(|error| error.to_string())
             });
             let took = start.elapsed();
-            drop(policy);
+            let checkpoint = checkpoint.clone();
+            drop(loaded);
             let answer = Answer {
                 job,
+                checkpoint,
                 decision,
                 took,
             };

@@ -7,11 +7,15 @@ use gctn_policy::GctnPolicyParameters;
 use heightmap::Workspace;
 use msgs::{
     convert,
-    sctn_msgs::{Goal, Heightmap, PickPlace, PrimitiveSettings, StepConfirmation, StepResult},
+    sctn_msgs::{
+        Goal, Heightmap, LoadCheckpoint, LoadCheckpointRequest, PickPlace, PrimitiveSettings,
+        StepConfirmation, StepResult,
+    },
     sensor_msgs::{Image, JointState},
 };
 use node_kit::{
-    Context, Network as DdsNetwork, NoParameters, ParameterSource, Qos, RosArguments, Subscription,
+    CallOptions, Context, Network as DdsNetwork, NoParameters, ParameterSource, Qos, RosArguments,
+    Subscription,
 };
 use tokio::time::timeout;
 use ur5::{Joints, WorkCell};
@@ -160,6 +164,36 @@ async fn proposals_follow_goals_rejections_and_changed_scenes() {
     );
     assert_ne!(third.id, second.id);
 
+    // Another checkpoint, while the node is at work; one that is none changes nothing.
+    let load = node
+        .service_client::<LoadCheckpoint>("gctn_policy/load_checkpoint")
+        .unwrap();
+    let other = directory.path().join("other.safetensors");
+    let ask = async |id: &str, path: &std::path::Path| {
+        let request = LoadCheckpointRequest {
+            request_id: id.into(),
+            path: path.display().to_string(),
+        };
+        load.call(&request, &CallOptions::default()).await.unwrap()
+    };
+    let refused = ask("none", &other).await;
+    assert!(
+        !refused.success && refused.message.contains("other"),
+        "{refused:?}"
+    );
+    assert_eq!(refused.path, checkpoint.display().to_string());
+    std::fs::copy(&checkpoint, &other).unwrap();
+    let used = ask("another", &other).await;
+    assert!(used.success, "{used:?}");
+    assert_eq!(
+        (used.path, used.previous),
+        (other.display().to_string(), refused.path)
+    );
+    assert_eq!(third.checkpoint, "small");
+    heightmaps.publish(heightmap(CELLS, 4, 3));
+    let third = next(&mut proposals).await;
+    assert_eq!(third.checkpoint, "other");
+
     // Approved and moved: what is seen then makes no proposal.
     confirmations.publish(StepConfirmation {
         proposal_id: third.id,
@@ -172,7 +206,7 @@ async fn proposals_follow_goals_rejections_and_changed_scenes() {
         ..StepResult::default()
     });
     tokio::time::sleep(Duration::from_secs(1)).await;
-    heightmaps.publish(heightmap(CELLS, 4, 2));
+    heightmaps.publish(heightmap(CELLS, 5, 2));
     let none = timeout(Duration::from_secs(1), proposals.recv()).await;
     assert!(none.is_err(), "{none:?}");
     context.shutdown();

@@ -69,6 +69,41 @@ export class Api {
     return (await this.#fetch(path, {})).json();
   }
 
+  async text(path) {
+    return (await this.#fetch(path, {})).text();
+  }
+
+  /** A camera's image and its number. */
+  async image(path) {
+    const response = await this.#fetch(path, {});
+    const header = (name) => Number(response.headers.get(name));
+    const [height, width] = [header("x-rows"), header("x-cols")];
+    const rgb = new Uint8Array(await response.arrayBuffer());
+    const image = new ImageData(width, height);
+    for (let pixel = 0; pixel < width * height; pixel++) {
+      image.data.set(rgb.subarray(3 * pixel, 3 * pixel + 3), 4 * pixel);
+      image.data[4 * pixel + 3] = 255;
+    }
+    return { number: header("x-number"), image };
+  }
+
+  /** The score maps of pick and place, each as colours without heights, and their number. */
+  async scores() {
+    const response = await this.#fetch("scores", {});
+    const header = (name) => Number(response.headers.get(name));
+    const [rows, width] = [header("x-rows"), header("x-cols")];
+    const [rgb, cols] = [new Uint8Array(await response.arrayBuffer()), width / 2];
+    const half = (side) => {
+      const colors = new Uint8Array(3 * rows * cols);
+      for (let row = 0; row < rows; row++) {
+        const start = 3 * (row * width + side * cols);
+        colors.set(rgb.subarray(start, start + 3 * cols), 3 * row * cols);
+      }
+      return { rows, cols, rgb: colors, height_m: new Float32Array(rows * cols) };
+    };
+    return { number: header("x-number"), pick_scores: half(0), place_scores: half(1) };
+  }
+
   /** Colours and heights of a heightmap, and its number. */
   async heightmap(which) {
     const response = await this.#fetch(which.includes("/") ? which : `heightmaps/${which}`, {});

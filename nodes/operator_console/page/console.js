@@ -1,7 +1,9 @@
 // The operator's page: what the console says, as pictures and words, and the operator's decisions.
 
 import { Api } from "./api.js";
-import { board, draw, drawProposal, middleOfObject, pointed } from "./view.js";
+import { Arm } from "./arm.js";
+import { CameraViews } from "./cameras.js";
+import { board, draw, drawProposal, make, middleOfObject, pointed } from "./view.js";
 
 const ROBOT_MODES = {
   "-1": "no controller", 0: "disconnected", 1: "confirm safety", 2: "booting", 3: "power off", 4: "power on", 5: "idle",
@@ -15,6 +17,8 @@ const SAFETY_MODES = {
 const LEGENDS = {
   color: "Yellow ring: pick. Green cross: place; its hand shows the turn.",
   height: "Dark blue: the table. Yellow: the highest.",
+  pick_scores: "Where the policy would pick: the brighter, the rather.",
+  place_scores: "Where the policy would place: the brighter, the rather.",
   difference: "Orange: something is to come here. Blue: something is to go. Pink: the colour differs.",
 };
 const DECISIONS = ["approve", "reject", "advance", "retry", "stop"];
@@ -36,16 +40,13 @@ let correction = null;
 let lessonShown = "";
 
 const api = new Api((next) => { state = next; render(); }, (word) => {
-  if (word === "up" && link !== "up") loadLibrary();
+  if (word === "up" && link !== "up") {
+    loadLibrary();
+    loadCheckpoints();
+  }
   link = word;
   renderLink();
 });
-
-function make(tag, properties, ...children) {
-  const made = Object.assign(document.createElement(tag), properties);
-  made.append(...children);
-  return made;
-}
 
 /** Changes the page only where its text is another one: what has the focus or is being read stays. */
 function setText(node, text) {
@@ -57,12 +58,12 @@ function isOperator() {
 }
 
 /** Loads a picture unless it is there. */
-function need(which, number) {
+function need(which, number, load = () => api.heightmap(which)) {
   const picture = pictures.get(which);
   if (picture?.number === number) return picture;
   if (!loading.has(which)) {
     loading.add(which);
-    api.heightmap(which)
+    load()
       .then((loaded) => pictures.set(which, loaded))
       .catch(() => {})
       .finally(() => { loading.delete(which); render(); });
@@ -260,6 +261,77 @@ async function loadLibrary() {
     return make("li", {}, make("p", { textContent: words }), pictures, repeat);
   });
   $("library").replaceChildren(...items);
+  // What is chosen stays so when the list is read again.
+  const chosen = new Map([...document.querySelectorAll("#train-tasks select")].map((select) => [select.name, select.value]));
+  const choices = list.map(({ name }) => {
+    const select = make("select", { name });
+    for (const [value, words] of [["", "leave out"], ["learn", "learn from"], ["held_out", "hold out"]]) select.append(make("option", { value, textContent: words }));
+    select.value = chosen.get(name) ?? "";
+    return make("label", {}, `${name} `, select);
+  });
+  $("train-tasks").replaceChildren($("train-tasks").firstElementChild, ...choices);
+  $("train").hidden = list.length < 2;
+}
+
+async function loadCheckpoints() {
+  const list = await api.get("checkpoints").catch(() => []);
+  $("policy").replaceChildren(...list.map(({ name }) => make("option", { value: name, textContent: name })));
+  $("policy-label").hidden = $("use-policy").hidden = list.length === 0;
+}
+
+/** Asks the policy for another checkpoint. */
+function changePolicy(path, body) {
+  if (!isOperator()) setText($("policy-note"), "You are watching. Take control to change the policy.");
+  else ask(() => api.post(path, body));
+}
+$("use-policy").addEventListener("click", () => changePolicy("checkpoints/use", { name: $("policy").value }));
+$("policy-back").addEventListener("click", () => changePolicy("checkpoints/back"));
+
+$("train").addEventListener("submit", (event) => {
+  event.preventDefault();
+  if (!isOperator()) return setText($("training-state"), "You are watching. Take control to train.");
+  const { name, steps } = event.target.elements;
+  const tasks = (use) => [...document.querySelectorAll("#train-tasks select")].filter((select) => select.value === use).map((select) => select.name);
+  ask(() => api.post("training/start", { name: name.value, steps: steps.valueAsNumber, learn: tasks("learn"), held_out: tasks("held_out") }));
+});
+$("cancel-training").addEventListener("click", () => ask(() => api.post("training/cancel")));
+
+let trainingShown = "";
+
+function renderTraining() {
+  const { training } = state;
+  const atWork = training?.phase === "training" || training?.phase === "comparing";
+  $("cancel-training").hidden = $("training-progress").hidden = !atWork;
+  $("comparison").hidden = !training?.comparison;
+  if (!training) return;
+  $("training-progress").value = training.step / training.steps;
+  const words = {
+    training: `${training.name} is being trained: step ${training.step} of ${training.steps}. ${training.losses}${training.left ? `, ${training.left} left` : ""}`,
+    comparing: `${training.name} is compared with the policy of now on the held-out steps.`,
+    done: `${training.name} is trained. Choose it above to use it.`,
+    cancelled: `The training of ${training.name} was cancelled.`,
+    failed: `The training of ${training.name} failed: ${training.reason}`,
+  };
+  setText($("training-state"), words[training.phase]);
+  const { comparison } = training;
+  if (comparison) {
+    const row = (name, { pick_m, place_m, turn_rad }) => make("tr", {}, make("th", { scope: "row", textContent: name }),
+      ...[`${(1000 * pick_m).toFixed(1)} mm`, `${(1000 * place_m).toFixed(1)} mm`, `${(turn_rad / RADIANS).toFixed(1)}°`].map((textContent) => make("td", { textContent })));
+    setText($("comparison").caption, `Median distance from ${comparison.steps} held-out ${comparison.steps === 1 ? "step" : "steps"}`);
+    $("comparison").tBodies[0].replaceChildren(row(training.name, comparison.new), row("policy of now", comparison.now));
+  }
+  const phase = `${training.name} ${training.phase}`;
+  if (phase !== trainingShown && training.phase === "done") loadCheckpoints();
+  trainingShown = phase;
+}
+
+function renderPolicy() {
+  const name = (path) => path.split("/").at(-1).replace(/\.safetensors$/, "");
+  const { policy, proposal } = state;
+  $("policy-back").hidden = !policy;
+  if (policy) setText($("policy-back"), `Go back to ${name(policy.previous)}`);
+  const now = policy ? name(policy.checkpoint) : proposal?.checkpoint;
+  if (isOperator() || !$("policy-note").textContent) setText($("policy-note"), now ? `The policy uses ${now}.` : "");
 }
 
 /** Drags what is nearest to the pointer: pick or place. */
@@ -359,11 +431,15 @@ function renderPictures() {
   const present = map && (need("present", map.number) ?? pictures.get("present"));
   const goalMap = state.goal?.heightmap;
   const goal = goalMap && (need("goal", goalMap.number) ?? pictures.get("goal"));
-  const drawn = `${mode} ${present?.number} ${goal?.number}`;
+  const scored = mode.endsWith("_scores");
+  const scores = scored && state.scores ? need("scores", state.scores, () => api.scores()) : null;
+  if (scored && !state.scores) setText($("legend"), "There are no scores of the present proposal.");
+  const drawn = `${mode} ${present?.number} ${goal?.number} ${scores?.number}`;
   if ($("boards").dataset.drawn !== drawn) {
     $("boards").dataset.drawn = drawn;
-    const share = present ? draw(boards.now.canvas, present, mode, goal) : 0;
-    if (goal) draw(boards.goal.canvas, goal, mode === "difference" ? "color" : mode);
+    const shown = scores?.[mode] ?? present;
+    const share = shown ? draw(boards.now.canvas, shown, scored ? "color" : mode, goal) : 0;
+    if (goal) draw(boards.goal.canvas, goal, mode === "difference" || scored ? "color" : mode);
     setText($("now-note"), mode === "difference" && present && goal ? `(${(100 * share).toFixed(1)} % of it differs from the goal)` : "");
   }
   setText($("goal-note"), state.goal ? `(step ${state.goal.step} of ${state.goal.step_count}, ${state.goal.module})` : "");
@@ -374,14 +450,83 @@ function renderPictures() {
     boards.now.svg.dataset.drawn = overlay;
     drawProposal(boards.now.svg, map, present, proposal);
   }
+  cameras.show(map, present, proposal);
   const metres = (pose) => `x ${pose.x_m.toFixed(3)} m, y ${pose.y_m.toFixed(3)} m`;
   setText($("proposal"), correction
     ? correction.pick && correction.place
       ? `Your pick at ${metres(proposal.pick)}. Your place at ${metres(proposal.place)}, turned by ${Math.round(turnOf(proposal))}°.`
       : correction.pick ? "Now click where to place it." : "Click what to pick."
     : proposal
-    ? `Pick at ${metres(proposal.pick)}. Place at ${metres(proposal.place)}, turned by ${Math.round(turnOf(proposal))}°. The policy gives the pick ${Math.round(100 * proposal.pick_score)} % and the place ${Math.round(100 * proposal.place_score)} %.`
+    ? `Pick at ${metres(proposal.pick)}. Place at ${metres(proposal.place)}, turned by ${Math.round(turnOf(proposal))}°.${whose(proposal)}`
     : "");
+}
+
+let motion = null;
+let motionFor = "";
+let robotAsked = false;
+
+const arm = new Arm($("arm"), (time_s, goesOn) => {
+  $("time").value = time_s;
+  $("time").setAttribute("aria-valuetext", `${time_s.toFixed(1)} s`);
+  setText($("play").firstChild, goesOn ? "Pause " : "Play the planned motion ");
+});
+$("time").addEventListener("input", () => {
+  arm.stop();
+  arm.show($("time").valueAsNumber);
+});
+$("play").addEventListener("click", playMotion);
+
+function playMotion() {
+  if (!arm.playing) return arm.play();
+  arm.stop();
+  arm.show($("time").valueAsNumber);
+}
+
+/** The motion of the proposal that waits, played once of itself unless the person wants less motion; else the robot as it is. */
+function renderMotion() {
+  if (state.robot_description && !robotAsked) {
+    robotAsked = true;
+    api.text("robot_description").then((urdf) => { arm.load(urdf); motionFor = ""; render(); }).catch(() => { robotAsked = false; });
+  }
+  const wanted = arm.ready && state.phase === "proposed" && state.motion ? state.proposal.id : "";
+  if (wanted !== motionFor) {
+    motionFor = wanted;
+    motion = null;
+    arm.setMotion(null);
+    if (wanted) {
+      api.get("motion").then((loaded) => {
+        if (loaded.proposal_id !== motionFor) return;
+        motion = loaded;
+        arm.setMotion(loaded);
+        if (loaded.times_s.length && !matchMedia("(prefers-reduced-motion: reduce)").matches) arm.play();
+        render();
+      }).catch(() => { motionFor = ""; });
+    }
+  }
+  const playable = Boolean(motion?.times_s.length);
+  $("play").hidden = $("time-label").hidden = !playable;
+  if (playable) $("time").max = motion.times_s.at(-1);
+  setText($("motion-note"), playable ? `The planned motion takes ${motion.times_s.at(-1).toFixed(1)} s. Green: with suction.`
+    : motion?.reason ? `The motion cannot be planned: ${motion.reason}`
+    : arm.ready ? "The robot as it is now." : "Nobody has described the robot.");
+  const [map, present] = [state.heightmap, pictures.get("present")];
+  const table = `${map?.number} ${present?.number}`;
+  if (present && $("arm").dataset.table !== table) {
+    $("arm").dataset.table = table;
+    arm.setTable(map, present);
+  }
+  if (state.joints) arm.setPositions(state.joints);
+}
+
+const cameras = new CameraViews(api, $("cameras"), $("camera-list"));
+
+/** Who made a proposal, and how sure of it; a person's corrections have no scores. */
+function whose({ author, checkpoint, pick_score, place_score, success_probability }) {
+  const percent = (share) => `${Math.round(100 * share)} %`;
+  if (!checkpoint && author) return ` Made by ${author}.`;
+  const by = author ? ` Made by ${author}${checkpoint ? ` with ${checkpoint}` : ""}.` : "";
+  const success = success_probability == null ? "" : ` It expects the step to succeed with ${percent(success_probability)}.`;
+  return `${by} The policy gives the pick ${percent(pick_score)} and the place ${percent(place_score)}.${success}`;
 }
 
 /** A small picture in a list. */
@@ -475,9 +620,12 @@ function render() {
   renderRole();
   renderLesson();
   renderPictures();
+  renderMotion();
   renderButtons();
   renderStrip();
   renderMessages();
+  renderPolicy();
+  renderTraining();
   renderPeople();
   renderRobot();
   renderSteps();
@@ -488,9 +636,10 @@ for (const radio of document.querySelectorAll("input[name=mode]")) radio.addEven
 
 const KEYS = new Map([...document.querySelectorAll("[aria-keyshortcuts]")].map((button) => [button.getAttribute("aria-keyshortcuts"), button.id]));
 document.addEventListener("keydown", (event) => {
-  const typing = event.target.matches?.("input:not([type=radio], [type=checkbox]), textarea, dialog *");
+  const typing = event.target.matches?.("input:not([type=radio], [type=checkbox], [type=range]), select, textarea, dialog *");
   if (typing || event.repeat || event.ctrlKey || event.altKey || event.metaKey || !$("keys").checked) return;
   const action = KEYS.get(event.key.toLowerCase());
+  if (action === "play" && !$("play").hidden) return playMotion();
   if (action && !$(action).hidden) {
     event.preventDefault();
     act(action);

@@ -118,6 +118,12 @@ export function middleOfObject(map, picture, x_m, y_m) {
   return [x_m + (colSum / area) * map.pixel_size_m, y_m + (rowSum / area) * map.pixel_size_m];
 }
 
+export function make(tag, properties, ...children) {
+  const made = Object.assign(document.createElement(tag), properties);
+  made.append(...children);
+  return made;
+}
+
 function element(name, attributes, parent, text) {
   const made = document.createElementNS(SVG, name);
   for (const [key, value] of Object.entries(attributes)) made.setAttribute(key, value);

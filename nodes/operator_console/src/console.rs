@@ -9,12 +9,14 @@ use bags::Demonstration;
 use msgs::convert;
 use msgs::sctn_msgs::{Heightmap, PickPlace, PrimitiveSettings, StepConfirmation, StepResult};
 use serde::Serialize;
+use step_protocol::StepOutcome;
 use tokio::sync::{mpsc, watch};
 
 use crate::lesson::{Lesson, LessonState};
 use crate::refusal::Refusal;
 use crate::run::{Decision, InvalidMessage, Phase, Pose, Run, Snapshot};
 use crate::session::{Sessions, ViewerId, ViewerState};
+use crate::training::TrainingState;
 
 /// Confirmations of ours that have not come back on the topic yet.
 const SENT: usize = 64;
@@ -32,6 +34,8 @@ pub enum Command {
     SetStep(u32, String),
     /// Have the oracle load the demonstration at this path; for whom.
     Load(PathBuf, String),
+    /// Have the policy load the checkpoint at this path; for whom.
+    LoadCheckpoint(PathBuf, String),
 }
 
 /// The state behind one lock.
@@ -42,9 +46,20 @@ pub struct State {
     pub sessions: Sessions,
     /// The lesson that is being given.
     lesson: Option<Lesson>,
+    /// The policy's checkpoint, once it was changed.
+    pub policy: Option<PolicyState>,
     /// Proposal and decision of our own confirmations: what they change was changed when they were made.
     sent: VecDeque<(u64, u8)>,
     commands: Option<mpsc::UnboundedSender<Command>>,
+}
+
+/// Which checkpoint the policy uses, and which it used before.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct PolicyState {
+    /// Path on the policy's machine.
+    pub checkpoint: String,
+    /// The one before: to go back.
+    pub previous: String,
 }
 
 /// Shared by the server and the node.
@@ -63,6 +78,8 @@ struct Message<'a> {
     operator: Option<ViewerId>,
     viewers: Vec<ViewerState>,
     lesson: Option<LessonState>,
+    policy: Option<PolicyState>,
+    training: Option<TrainingState>,
     #[serde(flatten)]
     run: Snapshot<'a>,
 }
@@ -75,6 +92,7 @@ impl Console {
                 run,
                 sessions,
                 lesson: None,
+                policy: None,
                 sent: VecDeque::new(),
                 commands: None,
             }),
@@ -123,11 +141,11 @@ impl Console {
         self.version.subscribe()
     }
 
-    /// The state as JSON.
+    /// The state as JSON, with the training's.
     ///
     /// # Errors
     /// When it cannot be written as JSON.
-    pub fn snapshot(&self) -> serde_json::Result<String> {
+    pub fn snapshot(&self, training: Option<TrainingState>) -> serde_json::Result<String> {
         self.read(|state, now| {
             serde_json::to_string(&Message {
                 kind: "state",
@@ -135,6 +153,8 @@ impl Console {
                 operator: state.sessions.operator(),
                 viewers: state.sessions.states(now),
                 lesson: state.lesson.as_ref().map(Lesson::state),
+                policy: state.policy.clone(),
+                training,
                 run: state.run.snapshot(now),
             })
         })
@@ -210,10 +230,11 @@ impl State {
         Ok(())
     }
 
-    /// Executor or oracle has reported.
+    /// The executor has reported.
     pub fn on_result(&mut self, message: &StepResult, now: Duration) -> Result<(), InvalidMessage> {
+        let result = convert::result_from_msg(message).map_err(|error| error.to_string())?;
         let by_itself =
-            message.outcome == StepResult::STOPPED && self.run.phase() != Phase::Stopped;
+            result.outcome == StepOutcome::Stopped && self.run.phase() != Phase::Stopped;
         self.run.on_result(message, now)?;
         if by_itself && self.lesson.is_none() && self.run.phase() == Phase::Stopped {
             // The executor has stopped by itself, for instance because the operator was gone: everybody has to know that the run
@@ -225,11 +246,8 @@ impl State {
                 ..StepConfirmation::default()
             });
         }
-        if let (Some(lesson), Ok(ended)) = (
-            &mut self.lesson,
-            convert::time_from_msg(&message.header.stamp),
-        ) {
-            lesson.on_result(message, ended);
+        if let Some(lesson) = &mut self.lesson {
+            lesson.on_result(&result);
             // The view may have come before the result.
             if let Some(view) = self.run.present() {
                 lesson.on_heightmap(view);
@@ -303,7 +321,10 @@ impl State {
         now: Duration,
     ) -> Result<(), Refusal> {
         let number = self.lesson(viewer)?.next();
-        let (proposal, view) = self.run.lesson_step(pick, place, settings, number, now)?;
+        let author = self.sessions.name(viewer);
+        let (proposal, view) = self
+            .run
+            .lesson_step(pick, place, settings, number, author, now)?;
         let view = view.clone();
         let id = proposal.id;
         self.lesson(viewer)?
@@ -360,13 +381,38 @@ impl State {
         self.send(Command::Load(path, name))
     }
 
+    /// The operator gives the policy another checkpoint, from the next proposal on.
+    ///
+    /// # Errors
+    /// When somebody else decides.
+    pub fn use_checkpoint(&mut self, viewer: ViewerId, path: PathBuf) -> Result<(), Refusal> {
+        self.sessions.check_operator(viewer)?;
+        let name = self.sessions.name(viewer).to_owned();
+        self.send(Command::LoadCheckpoint(path, name))
+    }
+
+    /// The operator gives the policy the checkpoint that it had before.
+    ///
+    /// # Errors
+    /// When somebody else decides, or the checkpoint was not changed.
+    pub fn use_previous_checkpoint(&mut self, viewer: ViewerId) -> Result<(), Refusal> {
+        let policy = self.policy.as_ref().ok_or_else(|| {
+            Refusal::new(
+                "The policy's checkpoint was not changed here.",
+                "Choose a checkpoint.",
+            )
+        })?;
+        self.use_checkpoint(viewer, PathBuf::from(&policy.previous))
+    }
+
     /// The operator proposes another pick and place for the present goal. It needs an approval as every proposal does.
     ///
     /// # Errors
     /// When somebody else decides, nothing can be proposed now, or the poses lie outside the workspace.
     pub fn correct(&mut self, viewer: ViewerId, pick: Pose, place: Pose) -> Result<u64, Refusal> {
         self.sessions.check_operator(viewer)?;
-        let proposal = self.run.correction(pick, place)?;
+        let author = self.sessions.name(viewer);
+        let proposal = self.run.correction(pick, place, author)?;
         let id = proposal.id;
         self.send(Command::Propose(Box::new(proposal.clone())))?;
         self.run
@@ -452,6 +498,7 @@ pub(crate) mod tests {
             nodes: Vec::new(),
             executor: "/suction_executor".into(),
             stale_after: Duration::from_secs(3),
+            changes: heightmap::ChangeRules::default(),
         };
         let sessions = Sessions::new(4, Duration::from_secs(60));
         let console = Console::new(Run::new(watch), sessions);
@@ -503,6 +550,17 @@ pub(crate) mod tests {
             state.on_result(&result, now).unwrap();
             state.on_heightmap(heightmap(), now).unwrap();
             state.run.on_reward(Default::default());
+            let planned = crate::preview::tests::planned(7);
+            state.run.on_planned_motion(planned).unwrap();
+            let scores = msgs::sensor_msgs::Image {
+                height: 1,
+                width: 2,
+                step: 6,
+                encoding: "rgb8".into(),
+                data: vec![0; 6].into(),
+                ..Default::default()
+            };
+            state.run.on_scores(scores).unwrap();
             let status = msgs::diagnostic_msgs::DiagnosticStatus {
                 name: "/gctn_policy: policy".into(),
                 ..Default::default()
@@ -515,6 +573,10 @@ pub(crate) mod tests {
             state
                 .run
                 .on_joints(vec!["elbow_joint".into()], vec![1.0], now);
+            state.policy = Some(PolicyState {
+                checkpoint: "new.safetensors".into(),
+                previous: "old.safetensors".into(),
+            });
             state.begin_lesson(ada).unwrap();
         });
         drop(commands);
@@ -549,6 +611,30 @@ pub(crate) mod tests {
     }
 
     #[test]
+    fn the_operator_changes_the_policy_and_goes_back() {
+        let (console, ada, mut commands) = proposed();
+        let back = || console.change(|state, _| state.use_previous_checkpoint(ada));
+        assert!(back().unwrap_err().reason.contains("not changed"));
+        let bob = console.change(|state, now| state.sessions.join("Bob", "b".into(), now).unwrap());
+        let load = |viewer| {
+            console.change(|state, _| state.use_checkpoint(viewer, "new.safetensors".into()))
+        };
+        load(bob).unwrap_err();
+        load(ada).unwrap();
+        let expected = Command::LoadCheckpoint("new.safetensors".into(), "Ada".into());
+        assert_eq!(commands.try_recv().unwrap(), expected);
+        console.change(|state, _| {
+            state.policy = Some(PolicyState {
+                checkpoint: "new.safetensors".into(),
+                previous: "old.safetensors".into(),
+            });
+        });
+        back().unwrap();
+        let expected = Command::LoadCheckpoint("old.safetensors".into(), "Ada".into());
+        assert_eq!(commands.try_recv().unwrap(), expected);
+    }
+
+    #[test]
     fn a_decision_on_another_proposal_than_the_present_one_is_refused() {
         let (console, ada, mut commands) = proposed();
         let refusal = decide(&console, ada, 6, Decision::Approve).unwrap_err();
@@ -578,6 +664,7 @@ pub(crate) mod tests {
         let refused = StepResult {
             proposal_id: 7,
             outcome: StepResult::REFUSED,
+            proposal_status: StepResult::PROPOSAL_PENDING,
             ..Default::default()
         };
         console

@@ -5,8 +5,10 @@ use std::time::Duration;
 
 use bags::{Demonstration, DemonstrationStep};
 use msgs::convert;
-use msgs::sctn_msgs::{Heightmap, PickPlace, StepResult};
+use msgs::sctn_msgs::{Heightmap, PickPlace};
+use pick_place::Outcome;
 use serde::Serialize;
+use step_protocol::{StepOutcome, StepResult};
 
 use crate::refusal::Refusal;
 use crate::run::{Pose, View};
@@ -38,7 +40,7 @@ struct Trial {
     /// It takes the last step back.
     undoes: bool,
     /// Outcome, and the end of the motion.
-    ended: Option<(u8, Duration)>,
+    ended: Option<(StepOutcome, Duration)>,
     after: Option<Arc<Heightmap>>,
 }
 
@@ -46,7 +48,7 @@ struct Trial {
 #[derive(Clone, Debug)]
 struct Shown {
     proposal: PickPlace,
-    outcome: u8,
+    outcome: Outcome,
     before: Arc<Heightmap>,
     after: Arc<Heightmap>,
 }
@@ -149,17 +151,17 @@ impl Lesson {
         (self.steps.len() as u32 + 1, self.trials)
     }
 
-    /// The executor has reported at `ended`. A refused motion is forgotten.
-    pub fn on_result(&mut self, result: &StepResult, ended: Duration) {
+    /// The executor has reported. A motion that was refused or rejected is forgotten.
+    pub fn on_result(&mut self, result: &StepResult) {
         let Some(trial) = &mut self.trial else {
             return;
         };
-        if trial.proposal.id != result.proposal_id {
+        if trial.proposal.id != result.proposal_id.0 {
             return;
         }
         match result.outcome {
-            StepResult::REFUSED | StepResult::REJECTED => self.trial = None,
-            outcome => trial.ended = Some((outcome, ended)),
+            StepOutcome::Refused | StepOutcome::Rejected => self.trial = None,
+            outcome => trial.ended = Some((outcome, result.stamp)),
         }
     }
 
@@ -181,7 +183,8 @@ impl Lesson {
     pub fn judge(&mut self, reached: bool) -> Result<(), Refusal> {
         self.check(LessonPhase::Judging)?;
         let ended = self.trial.as_ref().and_then(|trial| trial.ended);
-        if reached && ended.is_none_or(|(outcome, _)| convert::outcome_from_msg(outcome).is_err()) {
+        let motion = ended.and_then(|(outcome, _)| outcome.motion());
+        if reached && motion.is_none() {
             return Err(Refusal::new(
                 "The motion was broken off: it cannot be a step.",
                 "Bring the arm home, then try again.",
@@ -191,14 +194,14 @@ impl Lesson {
             proposal,
             before,
             undoes,
-            ended: Some((outcome, _)),
             after: Some(after),
+            ..
         }) = self.trial.take()
         else {
             return Ok(());
         };
-        match (reached, undoes) {
-            (true, false) => {
+        match (motion.filter(|_| reached), undoes) {
+            (Some(outcome), false) => {
                 self.steps.push(Shown {
                     proposal,
                     outcome,
@@ -207,11 +210,11 @@ impl Lesson {
                 });
                 self.unsaved = true;
             }
-            (true, true) => {
+            (Some(_), true) => {
                 self.steps.pop();
                 self.unsaved = true;
             }
-            (false, _) => {}
+            (None, _) => {}
         }
         Ok(())
     }
@@ -266,7 +269,7 @@ impl Lesson {
                 settings: convert::settings_from_msg(&shown.proposal.settings).map_err(invalid)?,
                 module: shown.proposal.module.clone(),
                 delta_reward: 1.0 / self.steps.len() as f64,
-                outcome: convert::outcome_from_msg(shown.outcome).map_err(invalid)?,
+                outcome: shown.outcome,
             })
         });
         Ok(Demonstration {

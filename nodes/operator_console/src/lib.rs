@@ -3,20 +3,25 @@
 //! `run::Run` is what the operator sees, `session::Sessions` who watches and who decides; neither knows ROS
 //! node, clock or network.
 
+mod cameras;
+mod checkpoints;
 mod console;
 mod lesson;
 mod library;
 mod parameters;
+mod preview;
 mod refusal;
 mod run;
 mod server;
 mod session;
 mod tls;
+mod training;
 
 use std::fs::OpenOptions;
 use std::io::Write as _;
 use std::os::unix::fs::OpenOptionsExt as _;
 use std::path::{Path, PathBuf};
+use std::pin::Pin;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -25,11 +30,12 @@ use bags::Demonstration;
 use msgs::convert;
 use msgs::diagnostic_msgs::DiagnosticArray;
 use msgs::sctn_msgs::{
-    Goal, Heightmap, LoadDemonstration, LoadDemonstrationRequest, OperatorPresence, PickPlace,
-    Reward, SetStep, SetStepRequest, StepConfirmation, StepResult,
+    ConfirmationRefused, Goal, Heightmap, LoadCheckpoint, LoadCheckpointRequest, LoadDemonstration,
+    LoadDemonstrationRequest, OperatorPresence, PickPlace, PlannedMotion, Reward, SetStep,
+    SetStepRequest, StepConfirmation, StepResult,
 };
-use msgs::sensor_msgs::JointState;
-use msgs::std_msgs::{Bool, Header};
+use msgs::sensor_msgs::{Image, JointState};
+use msgs::std_msgs::{self, Bool, Header};
 use msgs::std_srvs::{Trigger, TriggerRequest};
 use msgs::ur_dashboard_msgs::{RobotMode, SafetyMode};
 use msgs::ur_msgs::{Digital, IOStates};
@@ -39,19 +45,22 @@ use tokio_rustls::TlsAcceptor;
 use tokio_util::sync::CancellationToken;
 use tracing::{info, warn};
 
-use crate::console::{Command, Console};
+use crate::cameras::Cameras;
+use crate::checkpoints::Checkpoints;
+use crate::console::{Command, Console, PolicyState};
 use crate::library::Library;
-use crate::run::{Run, Watch};
+use crate::run::{Phase, Run, Watch};
 use crate::server::Access;
 use crate::session::Sessions;
 use crate::tls::Listener;
+use crate::training::Trainings;
 
 pub use parameters::{OperatorConsoleParameters, Tls};
 
 /// Time between messages that say whether the operator is present.
 const PRESENCE_PERIOD: Duration = Duration::from_millis(200);
 /// Joint states are taken over at most this often: a UR5 sends 500 a second.
-const JOINTS_PERIOD: Duration = Duration::from_millis(50);
+const JOINTS_PERIOD: Duration = Duration::from_millis(100);
 const CHOOSE_ANOTHER: &str =
     "Choose another demonstration, or look whether the goal oracle is at work.";
 /// How long the way home may take.
@@ -87,6 +96,10 @@ pub async fn configure(
             .collect(),
         executor: node.resolve(&parameters.executor),
         stale_after: Duration::from_secs_f64(parameters.stale_after_s),
+        changes: heightmap::ChangeRules::new(
+            parameters.observation_tolerance_m,
+            1e-6 * parameters.observation_changed_area_mm2,
+        ),
     };
     let session_timeout = Duration::from_secs_f64(parameters.session_timeout_s);
     let sessions = Sessions::new(parameters.max_viewers, session_timeout);
@@ -100,6 +113,20 @@ pub async fn configure(
             node.service_client(&format!("{}/load_demonstration", parameters.goal_oracle))?,
         ),
         library: Arc::new(Library::new(parameters.library.clone())),
+        checkpoints: Arc::new(Checkpoints::new([
+            parameters.checkpoints.clone(),
+            parameters.training.clone(),
+        ])),
+        trainings: Arc::new(Trainings::new(
+            parameters.sctn.clone(),
+            parameters.recipe.clone(),
+            parameters.training.clone(),
+            parameters.checkpoint.clone(),
+        )),
+        load_checkpoint: Arc::new(
+            node.service_client(&format!("{}/load_checkpoint", parameters.policy))?,
+        ),
+        cameras: Arc::new(Cameras::new(&parameters.cameras, &parameters.world_frame)),
         token: match parameters.token.as_str() {
             "" => secret(),
             token => token.to_owned(),
@@ -123,6 +150,10 @@ pub struct ConsoleNode {
     set_step: Arc<ServiceClient<SetStep>>,
     load: Arc<ServiceClient<LoadDemonstration>>,
     library: Arc<Library>,
+    checkpoints: Arc<Checkpoints>,
+    trainings: Arc<Trainings>,
+    load_checkpoint: Arc<ServiceClient<LoadCheckpoint>>,
+    cameras: Arc<Cameras>,
 }
 
 impl Active for ConsoleNode {
@@ -135,6 +166,7 @@ impl Active for ConsoleNode {
             show_demonstration(node, &self.console, path).await;
         }
         self.serve(node, &end).await?;
+        self.follow_cameras(node, &end);
         let io_and_status = |name| format!("{}/{name}", self.parameters.io_and_status);
         let mut heightmaps = node.subscription::<Heightmap>("heightmap", Qos::Latched)?;
         let mut goals = node.subscription::<Goal>("goal", Qos::Latched)?;
@@ -142,6 +174,8 @@ impl Active for ConsoleNode {
         let mut confirmations =
             node.subscription::<StepConfirmation>("step_confirmation", Qos::Event)?;
         let mut results = node.subscription::<StepResult>("step_result", Qos::Event)?;
+        let mut refused =
+            node.subscription::<ConfirmationRefused>("confirmation_refused", Qos::Event)?;
         let mut rewards = node.subscription::<Reward>("reward", Qos::Event)?;
         let mut diagnostics = node.subscription::<DiagnosticArray>("/diagnostics", Qos::Event)?;
         let mut joints = node.subscription::<JointState>("joint_states", Qos::Event)?;
@@ -152,6 +186,10 @@ impl Active for ConsoleNode {
             node.subscription::<SafetyMode>(&io_and_status("safety_mode"), Qos::Latched)?;
         let mut running =
             node.subscription::<Bool>(&io_and_status("robot_program_running"), Qos::Latched)?;
+        let mut motions = node.subscription::<PlannedMotion>("planned_motion", Qos::Latched)?;
+        let mut scores = node.subscription::<Image>("pick_place/scores", Qos::Latched)?;
+        let mut descriptions =
+            node.subscription::<std_msgs::String>("robot_description", Qos::Latched)?;
         let console = Arc::clone(&self.console);
         let mut joints_taken: Option<Instant> = None;
         let mut presence = tokio::time::interval(PRESENCE_PERIOD);
@@ -181,6 +219,24 @@ impl Active for ConsoleNode {
                         results.reject(reason);
                     }
                 }
+                message = motions.recv() => {
+                    if let Err(reason) = console.change(|state, _| state.run.on_planned_motion(message)) {
+                        motions.reject(reason);
+                    }
+                }
+                message = scores.recv() => {
+                    if let Err(reason) = console.change(|state, _| state.run.on_scores(message)) {
+                        scores.reject(reason);
+                    }
+                }
+                message = descriptions.recv() => {
+                    if let Err(reason) = console.change(|state, _| state.run.on_robot_description(message.data)) {
+                        descriptions.reject(reason);
+                    }
+                }
+                message = refused.recv() => {
+                    console.change(|state, now| state.run.on_confirmation_refused(&message, now));
+                }
                 message = rewards.recv() => console.change(|state, _| state.run.on_reward(message)),
                 message = diagnostics.recv() => {
                     console.change_quietly(|state, now| state.run.on_diagnostics(message, now));
@@ -195,7 +251,12 @@ impl Active for ConsoleNode {
                             ));
                             continue;
                         }
-                        console.change_quietly(|state, now| state.run.on_joints(name, position, now));
+                        let change = |state: &mut console::State, now| state.run.on_joints(name, position, now);
+                        // Viewers see the arm move.
+                        match console.read(|state, _| state.run.phase()) {
+                            Phase::Moving => console.change(change),
+                            _ => console.change_quietly(change),
+                        }
                     }
                 }
                 message = pins.recv() => {
@@ -254,6 +315,9 @@ impl ConsoleNode {
         let router = server::router(
             Arc::clone(&self.console),
             Arc::clone(&self.library),
+            Arc::clone(&self.checkpoints),
+            Arc::clone(&self.trainings),
+            Arc::clone(&self.cameras),
             access,
             end.clone(),
         );
@@ -265,6 +329,34 @@ impl ConsoleNode {
             }
         });
         Ok(())
+    }
+
+    /// Keeps images and transforms until `end`.
+    fn follow_cameras(&self, node: &Node, end: &CancellationToken) {
+        let watch =
+            |what: String, work: Pin<Box<dyn Future<Output = anyhow::Result<()>> + Send>>| {
+                let work = end.clone().run_until_cancelled_owned(work);
+                node.spawn(async move {
+                    if let Some(Err(error)) = work.await {
+                        warn!("{what} is not shown: {error:#}");
+                    }
+                });
+            };
+        let cameras = || Arc::clone(&self.cameras);
+        let transforms = cameras::follow_transforms(node.clone(), cameras());
+        watch(
+            "a proposal on the cameras' images".to_owned(),
+            Box::pin(transforms),
+        );
+        for name in self
+            .parameters
+            .cameras
+            .iter()
+            .filter(|name| !name.is_empty())
+        {
+            let images = cameras::follow(node.clone(), cameras(), name.clone());
+            watch(format!("camera {name}"), Box::pin(images));
+        }
     }
 
     fn publish_presence(&self, node: &Node) {
@@ -348,6 +440,41 @@ impl ConsoleNode {
                         ),
                     };
                     console.change(|state, now| state.run.note(kind, reason, advice, now));
+                });
+            }
+            Command::LoadCheckpoint(path, name) => {
+                info!("`{name}`: checkpoint {}", path.display());
+                let client = Arc::clone(&self.load_checkpoint);
+                let trainings = Arc::clone(&self.trainings);
+                let console = Arc::clone(&self.console);
+                let request = LoadCheckpointRequest {
+                    request_id: secret(),
+                    path: path.display().to_string(),
+                };
+                node.spawn(async move {
+                    let answer = client.call(&request, &CallOptions::default()).await;
+                    console.change(|state, now| {
+                        let refused = match answer {
+                            Ok(answer) if answer.success => {
+                                let shown = path.file_stem().unwrap_or_default().to_string_lossy();
+                                let reason =
+                                    format!("The policy uses {shown} from its next proposal on.");
+                                state.run.note("note", reason, "", now);
+                                trainings.begin_with(&answer.path);
+                                state.policy = Some(PolicyState {
+                                    checkpoint: answer.path,
+                                    previous: answer.previous,
+                                });
+                                return;
+                            }
+                            Ok(answer) => answer.message,
+                            Err(error) => error.to_string(),
+                        };
+                        let reason = format!("The policy has kept its checkpoint: {refused}.");
+                        let advice =
+                            "Choose another checkpoint, or look whether the policy is at work.";
+                        state.run.note("refusal", reason, advice, now);
+                    });
                 });
             }
             Command::SetStep(step, name) => {

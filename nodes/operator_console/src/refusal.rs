@@ -1,6 +1,8 @@
 //! Why something was not done, in words for a person, with what to do next.
 
+use msgs::sctn_msgs::ConfirmationRefused;
 use serde::Serialize;
+use step_protocol::ProposalStatus;
 
 /// Something that was asked for and not done.
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, thiserror::Error)]
@@ -22,8 +24,8 @@ impl Refusal {
     }
 }
 
-/// What a person should do about a reason that executor or oracle gave: part of the reason, advice.
-const ADVICE: [(&str, &str); 21] = [
+/// What a person should do about a reason why a proposal that stands may not be carried out now: part of the reason, advice.
+const ADVICE: [(&str, &str); 12] = [
     (
         "no operator is present",
         "Keep the page of the operator open and in sight while the arm moves.",
@@ -31,10 +33,6 @@ const ADVICE: [(&str, &str); 21] = [
     (
         "the observation has changed",
         "Something moved on the table since the proposal. Wait for the new proposal and look at it again.",
-    ),
-    (
-        "was superseded",
-        "A newer proposal has replaced it. Look at that one.",
     ),
     (
         "before the last motion ended",
@@ -52,16 +50,6 @@ const ADVICE: [(&str, &str); 21] = [
         "out of reach",
         "The arm cannot get there. Reject it: the policy will propose something else.",
     ),
-    ("was already carried out", "Say whether the step succeeded."),
-    ("was already rejected", "Wait for the next proposal."),
-    (
-        "was withdrawn by a stop",
-        "Bring the arm home if it stands in the way, then continue the run.",
-    ),
-    (
-        "is being carried out",
-        "Wait until the arm has finished, or stop it.",
-    ),
     (
         "on its way home",
         "Wait until the arm is at home, then approve again.",
@@ -69,19 +57,6 @@ const ADVICE: [(&str, &str); 21] = [
     (
         "already holds",
         "Take the object from the gripper, or bring the arm home, then look at the table again.",
-    ),
-    (
-        "the run was stopped",
-        "Continue the run with the present step.",
-    ),
-    ("all steps are done", "Nothing is left to do."),
-    (
-        "is of an earlier goal",
-        "It was about a step that is over. Look at the present proposal.",
-    ),
-    (
-        "decides by itself",
-        "You only approve and stop: the goal module says which step is next.",
     ),
     (
         "robot mode",
@@ -101,13 +76,46 @@ const ADVICE: [(&str, &str); 21] = [
     ),
 ];
 
-/// What to do next about a reason of the executor or the oracle.
+/// What to do next about why the robot may not move now.
 pub fn advice(reason: &str) -> &'static str {
     let mut known = ADVICE.iter();
     known.find(|(part, _)| reason.contains(part)).map_or(
         "Look at the cell. If it is safe, wait for the next proposal or continue with the present step.",
         |(_, advice)| advice,
     )
+}
+
+/// What to do next about a refusal of the executor, which says where the proposal stands.
+pub fn advice_for(status: Option<ProposalStatus>, reason: &str) -> &'static str {
+    match status {
+        Some(ProposalStatus::Superseded) => "A newer proposal has replaced it. Look at that one.",
+        Some(ProposalStatus::Moving) => "Wait until the arm has finished, or stop it.",
+        Some(ProposalStatus::Done) => "Say whether the step succeeded.",
+        Some(ProposalStatus::Rejected) => "Wait for the next proposal.",
+        Some(ProposalStatus::Withdrawn) => {
+            "Bring the arm home if it stands in the way, then continue the run."
+        }
+        Some(ProposalStatus::Pending) | None => advice(reason),
+    }
+}
+
+/// What to do next about a refusal of the goal oracle, by the constant of `ConfirmationRefused`.
+pub fn advice_of_oracle(reason: u8) -> &'static str {
+    match reason {
+        ConfirmationRefused::UNKNOWN => {
+            "The goal oracle has not heard of that proposal. Wait a moment, then say it again."
+        }
+        ConfirmationRefused::STALE => {
+            "It was about a step that is over. Look at the present proposal."
+        }
+        ConfirmationRefused::TWICE => "Wait until the arm has finished.",
+        ConfirmationRefused::STOPPED => "Continue the run with the present step.",
+        ConfirmationRefused::COMPLETE => "Nothing is left to do.",
+        ConfirmationRefused::NOT_ASKED => {
+            "You only approve and stop: the goal module says which step is next."
+        }
+        _ => "Look whether console and goal oracle are of the same version.",
+    }
 }
 
 #[cfg(test)]
@@ -119,5 +127,21 @@ mod tests {
         let reason = "proposal 7: the observation has changed since: 0.31 % of the cells";
         assert!(advice(reason).contains("Wait for the new proposal"));
         assert!(advice("something nobody thought of").contains("Look at the cell"));
+    }
+
+    #[test]
+    fn where_the_proposal_stands_decides_over_the_words_of_the_reason() {
+        let reason = "proposal 7: the observation has changed since: 0.31 % of the cells";
+        let superseded = advice_for(Some(ProposalStatus::Superseded), reason);
+        assert!(superseded.contains("replaced"), "{superseded}");
+        for status in [Some(ProposalStatus::Pending), None] {
+            assert_eq!(advice_for(status, reason), advice(reason));
+        }
+    }
+
+    #[test]
+    fn every_reason_of_the_oracle_has_its_own_advice() {
+        let all: std::collections::BTreeSet<_> = (1..=7).map(advice_of_oracle).collect();
+        assert_eq!(all.len(), 7);
     }
 }

@@ -4,16 +4,22 @@ use std::collections::{BTreeMap, VecDeque};
 use std::sync::Arc;
 use std::time::Duration;
 
+use heightmap::{Change, ChangeRules, largest_change};
 use msgs::builtin_interfaces::Time;
 use msgs::convert;
 use msgs::diagnostic_msgs::DiagnosticArray;
 use msgs::geometry_msgs::Pose2D;
 use msgs::sctn_msgs::{
-    Goal, Heightmap, PickPlace, PrimitiveSettings, Reward, StepConfirmation, StepResult,
+    ConfirmationRefused, Goal, Heightmap, PickPlace, PlannedMotion, PrimitiveSettings, Reward,
+    StepConfirmation, StepResult,
 };
+use msgs::sensor_msgs::Image;
+use nalgebra::Point2;
 use serde::{Deserialize, Serialize};
+use step_protocol::{OperatorDecision, ProposalStatus, StepOutcome};
 
-use crate::refusal::{Refusal, advice};
+use crate::preview::{Motion, Scores};
+use crate::refusal::{Refusal, advice, advice_for, advice_of_oracle};
 
 /// Past steps that are shown.
 const STEPS: usize = 64;
@@ -27,6 +33,8 @@ const HEIGHTMAPS: usize = 8;
 const NODES: usize = 64;
 /// Problem and task module of what is shown in a lesson.
 const LESSON: &str = "lesson";
+/// Longest description of a robot that is taken (bytes).
+const LONGEST_DESCRIPTION: usize = 1 << 20;
 
 /// What an operator decides, as the API names it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
@@ -56,13 +64,14 @@ impl Decision {
 
     /// As `StepConfirmation` has it.
     pub fn to_msg(self) -> u8 {
-        match self {
-            Self::Approve => StepConfirmation::APPROVE,
-            Self::Reject => StepConfirmation::REJECT,
-            Self::Advance => StepConfirmation::ADVANCE,
-            Self::Retry => StepConfirmation::RETRY,
-            Self::Stop => StepConfirmation::STOP,
-        }
+        let decision = match self {
+            Self::Approve => OperatorDecision::Approve,
+            Self::Reject => OperatorDecision::Reject,
+            Self::Advance => OperatorDecision::Advance,
+            Self::Retry => OperatorDecision::Retry,
+            Self::Stop => OperatorDecision::Stop,
+        };
+        decision.code()
     }
 
     fn from_msg(decision: u8) -> Option<Self> {
@@ -99,7 +108,8 @@ pub enum Phase {
 enum Status {
     Open,
     Approved,
-    Rejected,
+    /// It was rejected, withdrawn or superseded: it can never be approved again.
+    Closed,
     /// Carried out.
     Moved {
         fault: bool,
@@ -126,6 +136,17 @@ pub struct View {
 struct Offered {
     message: PickPlace,
     status: Status,
+    /// What has changed on the table since the heightmap that it was made from; nothing where that one is not known.
+    change: Option<TableChange>,
+}
+
+/// How the table differs from the heightmap that a proposal was made from.
+#[derive(Clone, Copy, Debug)]
+enum TableChange {
+    /// The largest change.
+    Blob(Change),
+    /// The heightmap covers another workspace.
+    Workspace,
 }
 
 /// A step that was carried out.
@@ -133,7 +154,7 @@ struct Offered {
 struct PastStep {
     number: u64,
     proposal: PickPlace,
-    outcome: u8,
+    outcome: StepOutcome,
     reason: String,
     duration: Duration,
     ended: Duration,
@@ -188,6 +209,8 @@ pub struct Watch {
     pub executor: String,
     /// Age from which a stream is stale.
     pub stale_after: Duration,
+    /// A proposal is stale when the table has changed by these since the heightmap that it was made from.
+    pub changes: ChangeRules,
 }
 
 /// The run.
@@ -215,6 +238,13 @@ pub struct Run {
     robot: Robot,
     joints: Option<(Duration, Vec<String>, Vec<f64>)>,
     reward: Option<Reward>,
+    /// The newest planned motion.
+    motion: Option<Motion>,
+    /// The newest score maps.
+    scores: Option<Arc<Scores>>,
+    score_count: u64,
+    /// URDF of the robot.
+    robot_description: Option<Arc<str>>,
 }
 
 /// Why a message cannot be shown.
@@ -247,6 +277,10 @@ impl Run {
             robot: Robot::default(),
             joints: None,
             reward: None,
+            motion: None,
+            scores: None,
+            score_count: 0,
+            robot_description: None,
         }
     }
 
@@ -274,7 +308,30 @@ impl Run {
             self.views.pop_front();
         }
         self.views.push_back(view);
+        self.compare();
         Ok(())
+    }
+
+    /// What has changed since the heightmap that the newest proposal was made from.
+    fn compare(&mut self) {
+        let (Some(id), Some(newest)) = (self.newest, self.views.back()) else {
+            return;
+        };
+        let rules = &self.watch.changes;
+        let Some(offered) = self
+            .offered
+            .iter_mut()
+            .rfind(|known| known.message.id == id)
+        else {
+            return;
+        };
+        let source = duration(&offered.message.header.stamp).ok();
+        let Some(source) = self.views.iter().rfind(|view| Some(view.stamp) == source) else {
+            return;
+        };
+        let PickPlace { pick, place, .. } = &offered.message;
+        let around = [pick, place].map(|pose| Point2::new(pose.x, pose.y));
+        offered.change = table_change(source, newest, rules, &around);
     }
 
     /// A goal has been latched.
@@ -333,21 +390,22 @@ impl Run {
                 ));
             }
         }
-        self.newest = Some(message.id);
-        if self
-            .offered
-            .iter()
-            .any(|known| known.message.id == message.id)
-        {
+        if let Some(known) = self.offered(message.id) {
+            if known.status != Status::Closed {
+                self.newest = Some(message.id);
+            }
             return Ok(());
         }
+        self.newest = Some(message.id);
         if self.offered.len() == PROPOSALS {
             self.offered.pop_front();
         }
         self.offered.push_back(Offered {
             message,
             status: Status::Open,
+            change: None,
         });
+        self.compare();
         Ok(())
     }
 
@@ -372,7 +430,7 @@ impl Run {
         if let Some(offered) = self.offered(message.proposal_id) {
             offered.status = match (decision, &offered.status) {
                 (Decision::Approve, Status::Open) => Status::Approved,
-                (Decision::Reject, Status::Open) => Status::Rejected,
+                (Decision::Reject, Status::Open) => Status::Closed,
                 (Decision::Advance | Decision::Retry, Status::Moved { fault }) => {
                     Status::Confirmed { fault: *fault }
                 }
@@ -381,39 +439,43 @@ impl Run {
         }
     }
 
-    /// Executor or oracle has reported.
+    /// The executor has reported.
     pub fn on_result(&mut self, message: &StepResult, now: Duration) -> Result<(), InvalidMessage> {
-        let ended = duration(&message.header.stamp)?;
-        let took = convert::duration_from_msg(&message.duration)
-            .map_err(|error| format!("duration.{error}"))?;
-        let fault = message.outcome == StepResult::FAULT;
-        match message.outcome {
-            StepResult::REFUSED => {
-                // The result was lost, for instance while the console was not there.
-                let was_carried_out = message.reason.contains("was already carried out");
-                if let Some(offered) = self.offered(message.proposal_id) {
-                    offered.status = match offered.status {
-                        Status::Approved if was_carried_out => Status::Moved { fault: false },
-                        Status::Approved => Status::Open,
-                        Status::Confirmed { fault } => Status::Moved { fault },
-                        ref status => status.clone(),
+        let result = convert::result_from_msg(message).map_err(|error| error.to_string())?;
+        let id = message.proposal_id;
+        match result.outcome {
+            StepOutcome::Refused => {
+                let carried_out = result.was_carried_out();
+                if let Some(offered) = self.offered(id) {
+                    offered.status = match (&offered.status, result.status) {
+                        // The result was lost, for instance while the console was not there.
+                        (Status::Approved, _) if carried_out => Status::Moved { fault: false },
+                        (Status::Open | Status::Approved, Some(status)) => match status {
+                            ProposalStatus::Moving => Status::Approved,
+                            ProposalStatus::Superseded
+                            | ProposalStatus::Rejected
+                            | ProposalStatus::Withdrawn => Status::Closed,
+                            ProposalStatus::Pending | ProposalStatus::Done => Status::Open,
+                        },
+                        (Status::Approved, None) => Status::Open,
+                        (status, _) => (*status).clone(),
                     };
                 }
                 // A stop that found nothing to stop has stopped the run all the same.
-                if self.stopped && self.offered(message.proposal_id).is_none() {
+                if self.stopped && self.offered(id).is_none() {
                     return Ok(());
                 }
-                let advice = advice(&message.reason);
-                self.note("refusal", sentence(&message.reason), advice, now);
+                let advice = advice_for(result.status, &result.reason);
+                self.note("refusal", sentence(&result.reason), advice, now);
                 return Ok(());
             }
-            StepResult::REJECTED => {
-                if let Some(offered) = self.offered(message.proposal_id) {
-                    offered.status = Status::Rejected;
+            StepOutcome::Rejected => {
+                if let Some(offered) = self.offered(id) {
+                    offered.status = Status::Closed;
                 }
                 return Ok(());
             }
-            StepResult::STOPPED => {
+            StepOutcome::Stopped => {
                 self.stopped = true;
                 self.note(
                     "note",
@@ -422,26 +484,31 @@ impl Run {
                     now,
                 );
             }
-            StepResult::FAULT => self.note(
+            StepOutcome::Fault => self.note(
                 "fault",
                 format!(
                     "The robot broke the motion off: {}",
-                    sentence(&message.reason)
+                    sentence(&result.reason)
                 ),
                 "Look at the cell. When it is safe, bring the arm home, then try the step again.",
                 now,
             ),
-            _ => {}
+            StepOutcome::Placed
+            | StepOutcome::NoContact
+            | StepOutcome::GraspFailed
+            | StepOutcome::Dropped
+            | StepOutcome::LagAborted => {}
         }
         let Some(offered) = self.offered(message.proposal_id) else {
             return Ok(());
         };
-        // A stop without motion ends nothing.
-        if took == Duration::ZERO && message.outcome == StepResult::STOPPED {
-            offered.status = Status::Rejected;
+        if !result.arm_moved() {
+            offered.status = Status::Closed;
             return Ok(());
         }
-        offered.status = Status::Moved { fault };
+        offered.status = Status::Moved {
+            fault: result.outcome == StepOutcome::Fault,
+        };
         let proposal = offered.message.clone();
         let before = duration(&proposal.header.stamp)?;
         let before = self
@@ -453,12 +520,13 @@ impl Run {
         if self.steps.len() == STEPS {
             self.steps.pop_front();
         }
+        let ended = result.stamp;
         self.steps.push_back(PastStep {
             number: self.step_count,
             proposal,
-            outcome: message.outcome,
-            reason: message.reason.clone(),
-            duration: took,
+            outcome: result.outcome,
+            reason: result.reason,
+            duration: result.duration,
             ended,
             decision: None,
             decided_by: String::new(),
@@ -466,6 +534,26 @@ impl Run {
             after: self.views.iter().find(|view| view.stamp >= ended).cloned(),
         });
         Ok(())
+    }
+
+    /// The oracle has refused a decision on a step that was carried out: it has changed nothing.
+    pub fn on_confirmation_refused(&mut self, message: &ConfirmationRefused, now: Duration) {
+        match message.reason {
+            // The question is still open.
+            ConfirmationRefused::UNKNOWN => {
+                if let Some(offered) = self.offered(message.proposal_id)
+                    && let Status::Confirmed { fault } = offered.status
+                {
+                    offered.status = Status::Moved { fault };
+                }
+            }
+            ConfirmationRefused::STOPPED => {
+                self.stopped = self.goal.as_ref().is_some_and(|goal| !goal.complete);
+            }
+            _ => {}
+        }
+        let advice = advice_of_oracle(message.reason);
+        self.note("refusal", sentence(&message.message), advice, now);
     }
 
     /// The simulator has measured.
@@ -498,6 +586,50 @@ impl Run {
                 .states
                 .insert(state.to_owned(), (status.level, status.message));
         }
+    }
+
+    /// The executor has planned the motion of a proposal.
+    pub fn on_planned_motion(&mut self, message: PlannedMotion) -> Result<(), InvalidMessage> {
+        self.motion = Some(Motion::from_msg(message)?);
+        Ok(())
+    }
+
+    /// The policy has drawn its scores.
+    pub fn on_scores(&mut self, message: Image) -> Result<(), InvalidMessage> {
+        self.score_count += 1;
+        self.scores = Some(Arc::new(Scores::from_msg(message, self.score_count)?));
+        Ok(())
+    }
+
+    /// The robot has been described, as URDF.
+    pub fn on_robot_description(&mut self, urdf: String) -> Result<(), InvalidMessage> {
+        if urdf.len() > LONGEST_DESCRIPTION {
+            let found = urdf.len();
+            return Err(format!(
+                "data has {found} bytes, expected at most {LONGEST_DESCRIPTION}"
+            ));
+        }
+        self.robot_description = Some(urdf.into());
+        Ok(())
+    }
+
+    /// URDF of the robot.
+    pub fn robot_description(&self) -> Option<Arc<str>> {
+        self.robot_description.clone()
+    }
+
+    /// The planned motion of the present proposal.
+    pub fn motion(&self) -> Option<&Motion> {
+        let id = self.current_id()?;
+        self.motion
+            .as_ref()
+            .filter(|motion| motion.proposal_id == id)
+    }
+
+    /// The scores of the heightmap that the present proposal was made from.
+    pub fn scores(&self) -> Option<&Arc<Scores>> {
+        let stamp = duration(&self.current()?.message.header.stamp).ok()?;
+        self.scores.as_ref().filter(|scores| scores.stamp == stamp)
     }
 
     /// The joints have been read.
@@ -550,7 +682,7 @@ impl Run {
             (*step, *attempt, problem) == (goal.step, goal.attempt, &goal.problem)
         };
         let offered = || self.offered.iter().rev().filter(of_this_goal);
-        let at_work = |known: &&Offered| !matches!(known.status, Status::Open | Status::Rejected);
+        let at_work = |known: &&Offered| !matches!(known.status, Status::Open | Status::Closed);
         offered()
             .find(at_work)
             .or_else(|| offered().find(|known| Some(known.message.id) == self.newest))
@@ -560,7 +692,7 @@ impl Run {
     ///
     /// # Errors
     /// When nothing can be proposed now, or a pose lies outside the workspace.
-    pub fn correction(&self, pick: Pose, place: Pose) -> Result<PickPlace, Refusal> {
+    pub fn correction(&self, pick: Pose, place: Pose, author: &str) -> Result<PickPlace, Refusal> {
         let phase = self.phase();
         if !matches!(phase, Phase::Proposed | Phase::AwaitingProposal) {
             return Err(out_of_phase(phase));
@@ -584,6 +716,7 @@ impl Run {
                 place: place.to_msg(),
                 settings: goal.settings,
                 module: goal.module.clone(),
+                author: author.to_owned(),
                 ..PickPlace::default()
             },
         )?;
@@ -610,6 +743,7 @@ impl Run {
         place: Pose,
         settings: PrimitiveSettings,
         (step, attempt): (u32, u32),
+        author: &str,
         now: Duration,
     ) -> Result<(PickPlace, &View), Refusal> {
         if let Some(refusal) = self.obstacle(now) {
@@ -624,6 +758,7 @@ impl Run {
             pick: pick.to_msg(),
             place: place.to_msg(),
             settings,
+            author: author.to_owned(),
             ..PickPlace::default()
         };
         Ok((from_view(view, proposal)?, view))
@@ -638,7 +773,7 @@ impl Run {
             Some(_) => {}
         }
         match self.current().map(|offered| &offered.status) {
-            None | Some(Status::Rejected | Status::Confirmed { .. }) => Phase::AwaitingProposal,
+            None | Some(Status::Closed | Status::Confirmed { .. }) => Phase::AwaitingProposal,
             Some(Status::Open) => Phase::Proposed,
             Some(Status::Approved) => Phase::Moving,
             Some(Status::Moved { fault: false }) => Phase::AwaitingConfirmation,
@@ -711,11 +846,26 @@ impl Run {
             return Err(out_of_phase(phase));
         }
         if decision == Decision::Approve
-            && let Some(refusal) = self.obstacle(now)
+            && let Some(refusal) = self.obstacle(now).or_else(|| self.change())
         {
             return Err(refusal);
         }
         Ok(())
+    }
+
+    /// Why the present proposal is stale: the table has changed since the heightmap that it was made from.
+    fn change(&self) -> Option<Refusal> {
+        let reason = match self.current()?.change? {
+            TableChange::Blob(change) => format!(
+                "The proposal is stale: the table has changed about ({:.3}, {:.3}) m since the picture that it was made from.",
+                change.center_m.x, change.center_m.y
+            ),
+            TableChange::Workspace => {
+                "The proposal is stale: the picture that it was made from shows another workspace."
+                    .to_owned()
+            }
+        };
+        Some(Refusal::new(reason, "Wait for the new proposal."))
     }
 
     /// Why nothing can be approved: something is stale, or the robot is not ready.
@@ -761,7 +911,11 @@ impl Run {
             let heard = self.health.get(node).map(|health| since(health.heard));
             streams.push(stream(node.trim_start_matches('/').to_owned(), heard, true));
         }
-        for health in self.health.values() {
+        let watched = self
+            .health
+            .iter()
+            .filter(|(node, _)| self.watch.nodes.contains(*node));
+        for (_, health) in watched {
             for (topic, age_s) in &health.images {
                 let age_s = age_s.map(|age_s| age_s + since(health.heard));
                 streams.push(stream(
@@ -825,6 +979,12 @@ impl Run {
                     .collect()
             }),
             reward: self.reward.as_ref().map(|reward| reward.total),
+            motion: self.motion().map(|motion| MotionState {
+                duration_s: motion.duration_s(),
+                reason: &motion.reason,
+            }),
+            scores: self.scores().map(|scores| scores.number),
+            robot_description: self.robot_description.is_some(),
         }
     }
 
@@ -948,6 +1108,24 @@ fn check_heightmap(message: &Heightmap) -> Result<(), InvalidMessage> {
     Ok(())
 }
 
+/// How the newest heightmap differs from the one that a proposal was made from, as the executor's gate has it.
+fn table_change(
+    source: &View,
+    newest: &View,
+    rules: &ChangeRules,
+    around: &[Point2<f64>],
+) -> Option<TableChange> {
+    if source.stamp == newest.stamp {
+        return None;
+    }
+    // The gate refuses a heightmap that cannot be converted.
+    let convert = |view: &View| convert::heightmap_from_msg(Heightmap::clone(&view.heightmap)).ok();
+    match largest_change(&convert(source)?, &convert(newest)?, rules, around) {
+        Ok(change) => change.map(TableChange::Blob),
+        Err(_) => Some(TableChange::Workspace),
+    }
+}
+
 fn contains(heightmap: &Heightmap, x_m: f64, y_m: f64) -> bool {
     let inside = |value: f64, origin: f64, cells: u32| {
         (0.0..f64::from(cells) * heightmap.pixel_size_m).contains(&(value - origin))
@@ -1014,6 +1192,17 @@ pub struct Snapshot<'a> {
     robot: &'a Robot,
     joints: Option<BTreeMap<&'a str, f64>>,
     reward: Option<f64>,
+    motion: Option<MotionState<'a>>,
+    scores: Option<u64>,
+    robot_description: bool,
+}
+
+/// The planned motion of the present proposal.
+#[derive(Debug, Serialize)]
+struct MotionState<'a> {
+    duration_s: f64,
+    /// Why it cannot be planned; empty where it can be.
+    reason: &'a str,
 }
 
 /// Where a heightmap lies.
@@ -1149,6 +1338,10 @@ pub struct ProposalState<'a> {
     place: Pose,
     pick_score: f32,
     place_score: f32,
+    /// Nothing where nothing estimates it.
+    success_probability: Option<f32>,
+    checkpoint: &'a str,
+    author: &'a str,
     stamp_s: f64,
 }
 
@@ -1168,6 +1361,10 @@ impl<'a> ProposalState<'a> {
             place: pose(&message.place),
             pick_score: message.pick_score,
             place_score: message.place_score,
+            success_probability: Some(message.success_probability)
+                .filter(|probability| (0.0..=1.0).contains(probability)),
+            checkpoint: &message.checkpoint,
+            author: &message.author,
             stamp_s: duration(&message.header.stamp).map_or(0.0, |stamp| stamp.as_secs_f64()),
         }
     }
@@ -1202,16 +1399,17 @@ impl<'a> StepState<'a> {
     }
 }
 
-pub(crate) fn outcome_words(outcome: u8) -> &'static str {
+pub(crate) fn outcome_words(outcome: StepOutcome) -> &'static str {
     match outcome {
-        StepResult::PLACED => "placed",
-        StepResult::NO_CONTACT => "found nothing to pick",
-        StepResult::GRASP_FAILED => "suction held nothing",
-        StepResult::DROPPED => "lost the object on the way",
-        StepResult::LAG_ABORTED => "stopped: the arm lagged behind",
-        StepResult::FAULT => "broke off by a fault",
-        StepResult::STOPPED => "stopped by the operator",
-        _ => "ended in an unknown way",
+        StepOutcome::Placed => "placed",
+        StepOutcome::NoContact => "found nothing to pick",
+        StepOutcome::GraspFailed => "suction held nothing",
+        StepOutcome::Dropped => "lost the object on the way",
+        StepOutcome::LagAborted => "stopped: the arm lagged behind",
+        StepOutcome::Fault => "broke off by a fault",
+        StepOutcome::Stopped => "stopped by the operator",
+        StepOutcome::Refused => "refused",
+        StepOutcome::Rejected => "rejected",
     }
 }
 

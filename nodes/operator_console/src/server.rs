@@ -1,5 +1,6 @@
 //! The page and its API over HTTP and WebSocket. docs/operator_console.openapi.yaml is its description.
 
+use std::collections::BTreeSet;
 use std::net::SocketAddr;
 use std::sync::Arc;
 use std::time::Duration;
@@ -27,11 +28,16 @@ use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
 use tracing::{info, warn};
 
+use crate::cameras::{CameraState, Cameras};
+use crate::checkpoints::{Checkpoint, Checkpoints};
 use crate::console::Console;
+use crate::lesson::check_name;
 use crate::library::{Entry, Library};
+use crate::preview::Motion;
 use crate::refusal::Refusal;
 use crate::run::{Decision, Pose, View};
 use crate::session::ViewerId;
+use crate::training::{Order, Trainings};
 
 /// Largest body of a request [bytes].
 const LARGEST_BODY: usize = 16 * 1024;
@@ -45,11 +51,13 @@ const SEND_TIMEOUT: Duration = Duration::from_secs(10);
 const SHORTEST_PERIOD: Duration = Duration::from_millis(40);
 /// Ages are told anew this often.
 const LONGEST_PERIOD: Duration = Duration::from_secs(1);
+/// Most gradient steps of a training.
+const MOST_TRAINING_STEPS: u64 = 100_000;
 /// Header with a viewer's key.
 const SESSION: HeaderName = HeaderName::from_static("x-session");
 
 /// The page: path, type, contents.
-const PAGE: [(&str, &str, &[u8]); 6] = [
+const PAGE: [(&str, &str, &[u8]); 8] = [
     (
         "/",
         "text/html; charset=utf-8",
@@ -74,6 +82,16 @@ const PAGE: [(&str, &str, &[u8]); 6] = [
         "/view.js",
         "text/javascript; charset=utf-8",
         include_bytes!("../page/view.js"),
+    ),
+    (
+        "/cameras.js",
+        "text/javascript; charset=utf-8",
+        include_bytes!("../page/cameras.js"),
+    ),
+    (
+        "/arm.js",
+        "text/javascript; charset=utf-8",
+        include_bytes!("../page/arm.js"),
     ),
     (
         "/icon.svg",
@@ -214,6 +232,9 @@ impl IntoResponse for Failure {
 struct Shared {
     console: Arc<Console>,
     library: Arc<Library>,
+    checkpoints: Arc<Checkpoints>,
+    trainings: Arc<Trainings>,
+    cameras: Arc<Cameras>,
     access: Arc<Access>,
     /// The newest snapshot as JSON; each WebSocket subscribes.
     snapshots: Arc<watch::Sender<Utf8Bytes>>,
@@ -224,15 +245,25 @@ struct Shared {
 pub fn router(
     console: Arc<Console>,
     library: Arc<Library>,
+    checkpoints: Arc<Checkpoints>,
+    trainings: Arc<Trainings>,
+    cameras: Arc<Cameras>,
     access: Access,
     end: CancellationToken,
 ) -> Router {
     let snapshots = Arc::new(watch::Sender::new(Utf8Bytes::default()));
-    let making = make_snapshots(Arc::clone(&console), Arc::clone(&snapshots));
+    let making = make_snapshots(
+        Arc::clone(&console),
+        Arc::clone(&trainings),
+        Arc::clone(&snapshots),
+    );
     tokio::spawn(end.clone().run_until_cancelled_owned(making));
     let shared = Shared {
         console,
         library,
+        checkpoints,
+        trainings,
+        cameras,
         access: Arc::new(access),
         snapshots,
         end,
@@ -248,12 +279,22 @@ pub fn router(
         .route("/home", post(home))
         .route("/step", post(set_step))
         .route("/heightmaps/{which}", get(heightmap))
+        .route("/cameras", get(list_cameras))
+        .route("/cameras/{name}", get(camera_image))
+        .route("/motion", get(motion))
+        .route("/scores", get(scores))
+        .route("/robot_description", get(robot_description))
         .route("/lesson/begin", post(begin_lesson))
         .route("/lesson/show", post(show_step))
         .route("/lesson/judge", post(judge_step))
         .route("/lesson/undo", post(undo_step))
         .route("/lesson/save", post(save_lesson))
         .route("/lesson/end", post(end_lesson))
+        .route("/checkpoints", get(list_checkpoints))
+        .route("/checkpoints/use", post(use_checkpoint))
+        .route("/checkpoints/back", post(use_previous_checkpoint))
+        .route("/training/start", post(start_training))
+        .route("/training/cancel", post(cancel_training))
         .route("/demonstrations", get(demonstrations))
         .route("/demonstrations/{name}/{step}", get(demonstration_picture))
         .route("/demonstrations/repeat", post(repeat))
@@ -277,12 +318,16 @@ pub fn router(
         .with_state(shared)
 }
 
-async fn make_snapshots(console: Arc<Console>, sender: Arc<watch::Sender<Utf8Bytes>>) {
+async fn make_snapshots(
+    console: Arc<Console>,
+    trainings: Arc<Trainings>,
+    sender: Arc<watch::Sender<Utf8Bytes>>,
+) {
     let mut version = console.version();
     loop {
         // Without viewers nothing is made; the next one has its first snapshot made for it.
         if sender.receiver_count() > 0 {
-            match console.snapshot() {
+            match console.snapshot(trainings.state()) {
                 Ok(snapshot) => {
                     sender.send_replace(snapshot.into());
                 }
@@ -437,13 +482,16 @@ async fn change_operator(
 }
 
 async fn state(State(shared): State<Shared>) -> Result<Response, Failure> {
-    let snapshot = shared.console.snapshot().map_err(|error| {
-        Failure::new(
-            StatusCode::INTERNAL_SERVER_ERROR,
-            format!("The state cannot be written as JSON: {error}."),
-            "Look at the node's log.",
-        )
-    })?;
+    let snapshot = shared
+        .console
+        .snapshot(shared.trainings.state())
+        .map_err(|error| {
+            Failure::new(
+                StatusCode::INTERNAL_SERVER_ERROR,
+                format!("The state cannot be written as JSON: {error}."),
+                "Look at the node's log.",
+            )
+        })?;
     Ok(([(CONTENT_TYPE, "application/json")], snapshot).into_response())
 }
 
@@ -561,6 +609,179 @@ async fn heightmap(
     ))
 }
 
+/// The checkpoints that the policy can be given.
+async fn list_checkpoints(State(shared): State<Shared>) -> Result<Json<Vec<Checkpoint>>, Failure> {
+    let checkpoints = Arc::clone(&shared.checkpoints);
+    Ok(Json(off_thread(move || checkpoints.list()).await?))
+}
+
+async fn use_checkpoint(
+    State(shared): State<Shared>,
+    Viewer(viewer): Viewer,
+    body: Result<Json<Named>, JsonRejection>,
+) -> Result<StatusCode, Failure> {
+    let Json(Named { name }) = body?;
+    let checkpoints = Arc::clone(&shared.checkpoints);
+    let path = off_thread(move || checkpoints.path(&name)).await??;
+    shared
+        .console
+        .change(|state, _| state.use_checkpoint(viewer, path))?;
+    Ok(StatusCode::ACCEPTED)
+}
+
+async fn use_previous_checkpoint(
+    State(shared): State<Shared>,
+    Viewer(viewer): Viewer,
+) -> Result<StatusCode, Failure> {
+    shared
+        .console
+        .change(|state, _| state.use_previous_checkpoint(viewer))?;
+    Ok(StatusCode::ACCEPTED)
+}
+
+#[derive(Deserialize)]
+#[serde(deny_unknown_fields)]
+struct StartTraining {
+    name: String,
+    /// Demonstrations of the library to learn from, and those that are held out.
+    learn: Vec<String>,
+    held_out: Vec<String>,
+    steps: u64,
+}
+
+async fn start_training(
+    State(shared): State<Shared>,
+    Viewer(viewer): Viewer,
+    body: Result<Json<StartTraining>, JsonRejection>,
+) -> Result<StatusCode, Failure> {
+    let Json(asked) = body?;
+    shared
+        .console
+        .read(|state, _| state.sessions.check_operator(viewer))?;
+    let StartTraining {
+        name,
+        learn,
+        held_out,
+        steps,
+    } = asked;
+    check_name(&name)?;
+    if !(1..=MOST_TRAINING_STEPS).contains(&steps) {
+        return Err(Refusal::new(
+            format!("{steps} steps cannot be trained."),
+            "Choose 1 to 100000 steps.",
+        )
+        .into());
+    }
+    if learn.is_empty() || held_out.is_empty() || learn.iter().any(|name| held_out.contains(name)) {
+        return Err(Refusal::new(
+            "What to learn from and what is held out is not said.",
+            "Choose at least one demonstration to learn from, and another one that is held out.",
+        )
+        .into());
+    }
+    let order = on_files(&shared, move |library| {
+        let entries = library.list();
+        let chosen = |names: &[String]| {
+            let entry = |name: &String| {
+                let mut entries = entries.iter();
+                let found = entries.find(|entry| entry.name == *name);
+                let entry = found.ok_or_else(|| {
+                    Refusal::new(
+                        format!("There is no demonstration {name}."),
+                        "Choose another one.",
+                    )
+                })?;
+                Ok((library.path(name)?, entry.problem.clone()))
+            };
+            names.iter().map(entry).collect::<Result<Vec<_>, Refusal>>()
+        };
+        let (learn, problems): (_, BTreeSet<_>) = chosen(&learn)?.into_iter().unzip();
+        let held_out = chosen(&held_out)?.into_iter();
+        Ok::<_, Refusal>(Order {
+            name,
+            learn,
+            problems: problems.into_iter().collect(),
+            held_out: held_out.map(|(path, _)| path).collect(),
+            steps,
+        })
+    });
+    shared.trainings.start(order.await??)?;
+    Ok(StatusCode::ACCEPTED)
+}
+
+async fn cancel_training(
+    State(shared): State<Shared>,
+    Viewer(viewer): Viewer,
+) -> Result<StatusCode, Failure> {
+    shared
+        .console
+        .read(|state, _| state.sessions.check_operator(viewer))?;
+    shared.trainings.cancel();
+    Ok(StatusCode::NO_CONTENT)
+}
+
+/// The cameras; their images come while somebody asks for this.
+async fn list_cameras(State(shared): State<Shared>) -> Json<Vec<CameraState>> {
+    Json(shared.cameras.look())
+}
+
+/// Red, green and blue of each pixel of a camera's newest image.
+async fn camera_image(
+    State(shared): State<Shared>,
+    Path(name): Path<String>,
+) -> Result<Response, Failure> {
+    let (number, width, height, rgb) = shared.cameras.image(&name).ok_or_else(|| {
+        Failure::new(
+            StatusCode::NOT_FOUND,
+            "There is no image of that camera.",
+            "Ask for a camera of /api/v1/cameras whose number is not 0.",
+        )
+    })?;
+    Ok(picture(number, height, width, &rgb, &[]))
+}
+
+/// The planned motion of the present proposal.
+async fn motion(State(shared): State<Shared>) -> Result<Json<Motion>, Failure> {
+    let motion = shared.console.read(|state, _| state.run.motion().cloned());
+    motion.map(Json).ok_or_else(|| {
+        Failure::new(
+            StatusCode::NOT_FOUND,
+            "The executor has not planned the motion of the present proposal.",
+            "Wait a moment.",
+        )
+    })
+}
+
+/// Red, green and blue of each cell of the two score maps.
+async fn scores(State(shared): State<Shared>) -> Result<Response, Failure> {
+    let scores = shared.console.read(|state, _| state.run.scores().cloned());
+    let scores = scores.ok_or_else(|| {
+        Failure::new(
+            StatusCode::NOT_FOUND,
+            "There are no scores of the present proposal.",
+            "Wait a moment.",
+        )
+    })?;
+    let image = &scores.image;
+    let (rows, cols) = (image.height as usize, image.width as usize);
+    Ok(picture(scores.number, rows, cols, &image.data, &[]))
+}
+
+async fn robot_description(State(shared): State<Shared>) -> Result<Response, Failure> {
+    let urdf = shared
+        .console
+        .read(|state, _| state.run.robot_description());
+    let urdf = urdf.ok_or_else(|| {
+        Failure::new(
+            StatusCode::NOT_FOUND,
+            "Nobody has described the robot.",
+            "Look whether robot_description is published.",
+        )
+    })?;
+    let headers = [(CONTENT_TYPE, "application/xml")];
+    Ok((headers, urdf.to_string()).into_response())
+}
+
 fn picture(number: u64, rows: usize, cols: usize, rgb: &[u8], height_m: &[f32]) -> Response {
     let mut bytes = Vec::with_capacity(rgb.len() + 4 * height_m.len());
     bytes.extend_from_slice(rgb);
@@ -666,17 +887,24 @@ struct Named {
     name: String,
 }
 
-/// Work on files, off the threads that serve.
+/// Work on the library's files.
 async fn on_files<T: Send + 'static>(
     shared: &Shared,
     work: impl FnOnce(&Library) -> T + Send + 'static,
 ) -> Result<T, Failure> {
     let library = Arc::clone(&shared.library);
-    let done = tokio::task::spawn_blocking(move || work(&library)).await;
+    off_thread(move || work(&library)).await
+}
+
+/// Work on files, off the threads that serve.
+async fn off_thread<T: Send + 'static>(
+    work: impl FnOnce() -> T + Send + 'static,
+) -> Result<T, Failure> {
+    let done = tokio::task::spawn_blocking(work).await;
     done.map_err(|_| {
         Failure::new(
             StatusCode::INTERNAL_SERVER_ERROR,
-            "The library could not be read.",
+            "The files could not be read.",
             "Look at the node's log.",
         )
     })
@@ -786,7 +1014,7 @@ async fn follow(shared: Shared, mut socket: WebSocket) {
     };
     heard(true);
     let mut snapshots = shared.snapshots.subscribe();
-    let first = match shared.console.snapshot() {
+    let first = match shared.console.snapshot(shared.trainings.state()) {
         Ok(first) => Utf8Bytes::from(first),
         Err(_) => return close(socket, close_code::ERROR, "no state").await,
     };

@@ -30,7 +30,7 @@ use crate::driver::{DriverError, DriverRobot, Link};
 use crate::home::go_home;
 use crate::parameters::SuctionExecutorParameters;
 use crate::presence::Presence;
-use crate::rehearsal::RobotNow;
+use crate::rehearsal::{RobotNow, planned_motion};
 use crate::status::DriverStatus;
 use crate::stop_memory::StopMemory;
 use crate::surface::touchdown;
@@ -65,6 +65,7 @@ pub async fn configure(
     }
     Ok(ExecutorNode {
         results: node.publisher("step_result", Qos::Event)?,
+        planned: node.publisher("planned_motion", Qos::Latched)?,
         gate,
         stop_memory,
         link: Arc::new(link),
@@ -88,6 +89,7 @@ fn rules(parameters: &SuctionExecutorParameters) -> GateRules {
 /// The configured node. What was used or stopped stays so while it is inactive.
 pub struct ExecutorNode {
     results: Publisher<sctn_msgs::StepResult>,
+    planned: Publisher<sctn_msgs::PlannedMotion>,
     gate: ApprovalGate,
     stop_memory: StopMemory,
     link: Arc<Link>,
@@ -108,6 +110,7 @@ impl Active for ExecutorNode {
                 parameters.borrow().presence_timeout_s,
             )),
             results: &self.results,
+            planned: &self.planned,
             home: node.service_server("~/home")?,
             home_calls: Vec::new(),
             goals: node.action_server("execute_pick_place")?,
@@ -172,6 +175,7 @@ struct Executor<'a> {
     presences: Subscription<sctn_msgs::OperatorPresence>,
     presence: Presence,
     results: &'a Publisher<sctn_msgs::StepResult>,
+    planned: &'a Publisher<sctn_msgs::PlannedMotion>,
     home: ServiceServer<Trigger>,
     /// Calls of `home` to be answered when the arm is there.
     home_calls: Vec<RequestId>,
@@ -298,9 +302,11 @@ impl Executor<'_> {
 
     fn on_proposal(&mut self, message: sctn_msgs::PickPlace) {
         let id = ProposalId(message.id);
-        match self.gate.on_proposal(id, read_proposal(&message)) {
+        let proposal = read_proposal(&message);
+        match self.gate.on_proposal(id, proposal.clone()) {
             Proposed::Pending => {
                 info!("proposal {id}");
+                self.show_plan(proposal.as_ref());
                 if self.gate.moves_unasked(id) {
                     self.confirm(id, OperatorDecision::Approve);
                 }
@@ -317,6 +323,23 @@ impl Executor<'_> {
         self.ask_again();
     }
 
+    /// Publishes how a pending proposal would be carried out.
+    fn show_plan(&self, proposal: Result<&Proposal, &String>) {
+        let Ok(proposal) = proposal else {
+            return;
+        };
+        let header = msgs::std_msgs::Header {
+            stamp: self.node.now(),
+            frame_id: self.parameters.world_frame.clone(),
+        };
+        let planned = self.robot().rehearse(proposal);
+        let names = &self.work_cell.joint_names;
+        match planned_motion(planned, proposal.id.0, names, header) {
+            Ok(motion) => self.planned.publish(motion),
+            Err(error) => warn!("the motion of proposal {}: {error}", proposal.id),
+        }
+    }
+
     /// A goal of the action is a proposal whose way its client follows; it goes through the same gate.
     fn on_goal(&mut self, new: NewGoal<ExecutePickPlace>) {
         let id = ProposalId(new.goal.proposal.id);
@@ -331,7 +354,11 @@ impl Executor<'_> {
         let pending = match busy {
             Some(busy) => Err(busy),
             None => {
-                let proposed = self.gate.on_proposal(id, read_proposal(&new.goal.proposal));
+                let proposal = read_proposal(&new.goal.proposal);
+                let proposed = self.gate.on_proposal(id, proposal.clone());
+                if matches!(proposed, Proposed::Pending) {
+                    self.show_plan(proposal.as_ref());
+                }
                 match proposed {
                     Proposed::Invalid(reason) => Err(reason.to_string()),
                     Proposed::Pending | Proposed::Repeated => self

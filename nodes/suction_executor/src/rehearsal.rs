@@ -5,9 +5,12 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use heightmap::Heightmap;
+use msgs::convert::{self, ConvertError};
+use msgs::std_msgs::Header;
+use msgs::{sctn_msgs, trajectory_msgs};
 use pick_place::Robot;
 use step_protocol::{Proposal, RobotState};
-use ur5::{Arm, JointTrajectory, Joints};
+use ur5::{Arm, JointTrajectory, Joints, TrajectoryPoint};
 
 use crate::parameters::{Contact, ContactSign};
 use crate::status::DriverStatus;
@@ -17,6 +20,68 @@ use crate::surface::touchdown;
 struct Rehearsal {
     joints: Joints,
     holds: bool,
+    motion: Motion,
+}
+
+/// The whole motion of a proposal, from where the arm stands until it is home.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub(crate) struct Motion {
+    /// Times are from the beginning and increase.
+    points: Vec<TrajectoryPoint>,
+    /// When suction is switched on, and when off.
+    suction: [Duration; 2],
+}
+
+impl Motion {
+    fn end(&self) -> Duration {
+        self.points
+            .last()
+            .map_or(Duration::ZERO, |point| point.time)
+    }
+
+    fn append(&mut self, trajectory: &JointTrajectory) {
+        let start = self.end();
+        for point in trajectory.points() {
+            let time = start + point.time;
+            if self.points.is_empty() || time > self.end() {
+                self.points.push(TrajectoryPoint { time, ..*point });
+            }
+        }
+    }
+}
+
+/// The message that shows a proposal's motion, or why there is none.
+pub(crate) fn planned_motion(
+    planned: Result<Motion, String>,
+    proposal_id: u64,
+    joint_names: &[String; 6],
+    header: Header,
+) -> Result<sctn_msgs::PlannedMotion, ConvertError> {
+    let (motion, reason) = match planned {
+        Ok(motion) => (motion, String::new()),
+        Err(reason) => (Motion::default(), reason),
+    };
+    let point = |point: &TrajectoryPoint| {
+        Ok::<_, ConvertError>(trajectory_msgs::JointTrajectoryPoint {
+            positions: point.positions_rad.iter().copied().collect(),
+            velocities: point.velocities_rad_s.iter().copied().collect(),
+            time_from_start: convert::duration_to_msg(point.time)?,
+            ..Default::default()
+        })
+    };
+    let [on, off] = motion.suction;
+    Ok(sctn_msgs::PlannedMotion {
+        trajectory: trajectory_msgs::JointTrajectory {
+            header: header.clone(),
+            joint_names: joint_names.to_vec(),
+            points: motion.points.iter().map(point).collect::<Result<_, _>>()?,
+        },
+        header,
+        proposal_id,
+        suction_on: convert::duration_to_msg(on)?,
+        suction_off: convert::duration_to_msg(off)?,
+        reason,
+    })
 }
 
 impl Robot for Rehearsal {
@@ -28,6 +93,7 @@ impl Robot for Rehearsal {
 
     fn follow(&mut self, trajectory: &JointTrajectory) -> Result<bool, Infallible> {
         self.joints = trajectory.last().positions_rad;
+        self.motion.append(trajectory);
         Ok(true)
     }
 
@@ -37,6 +103,7 @@ impl Robot for Rehearsal {
 
     fn set_suction(&mut self, on: bool) -> Result<(), Infallible> {
         self.holds = on;
+        self.motion.suction[usize::from(!on)] = self.motion.end();
         Ok(())
     }
 
@@ -79,17 +146,7 @@ impl RobotState for RobotNow {
 
     /// Plans every motion of a proposal from where the robot is.
     fn plan(&self, proposal: &Proposal) -> Result<(), String> {
-        let (Some(joints), Some(pins)) = (&self.status.joints, &self.status.pins) else {
-            return Err("the robot's state is not known".into());
-        };
-        let mut robot = Rehearsal {
-            joints: joints.value.positions_rad,
-            holds: pins.value.vacuum,
-        };
-        let Proposal {
-            action, settings, ..
-        } = proposal;
-        let Some((heightmap, stamp)) = &self.seen else {
+        let Some((_, stamp)) = &self.seen else {
             return Err("no heightmap has arrived".into());
         };
         let in_view = |stamp| self.status.at_home.may_be_in_view(stamp);
@@ -104,6 +161,27 @@ impl RobotState for RobotNow {
                 self.observation_max_age.as_secs_f64()
             ));
         }
+        self.rehearse(proposal).map(|_| ())
+    }
+}
+
+impl RobotNow {
+    /// The motion of a proposal from where the robot is; else why it cannot be planned.
+    pub fn rehearse(&self, proposal: &Proposal) -> Result<Motion, String> {
+        let (Some(joints), Some(pins)) = (&self.status.joints, &self.status.pins) else {
+            return Err("the robot's state is not known".into());
+        };
+        let mut robot = Rehearsal {
+            joints: joints.value.positions_rad,
+            holds: pins.value.vacuum,
+            motion: Motion::default(),
+        };
+        let Proposal {
+            action, settings, ..
+        } = proposal;
+        let Some((heightmap, _)) = &self.seen else {
+            return Err("no heightmap has arrived".into());
+        };
         let touchdown = touchdown(heightmap, action, &self.contact, self.sign)?;
         pick_place::execute_on(
             &mut robot,
@@ -113,8 +191,8 @@ impl RobotState for RobotNow {
             touchdown.as_ref(),
             |_| (),
         )
-        .map(|_| ())
-        .map_err(|error| one_line(&error.to_string()))
+        .map_err(|error| one_line(&error.to_string()))?;
+        Ok(robot.motion)
     }
 }
 
@@ -180,6 +258,34 @@ mod tests {
         };
         assert_eq!(robot.obstacle(), None);
         robot.plan(&proposal(0.5)).unwrap();
+        let motion = robot.rehearse(&proposal(0.5)).unwrap();
+        let names: [String; 6] = std::array::from_fn(|joint| format!("joint {joint}"));
+        let message = planned_motion(Ok(motion), 7, &names, Header::default()).unwrap();
+        assert_eq!((message.proposal_id, message.reason.as_str()), (7, ""));
+        let points = &message.trajectory.points;
+        assert!(points.len() > 100, "{}", points.len());
+        let time =
+            |stamp: &msgs::builtin_interfaces::Duration| convert::duration_from_msg(stamp).unwrap();
+        let times: Vec<_> = points
+            .iter()
+            .map(|point| time(&point.time_from_start))
+            .collect();
+        assert!(times.is_sorted_by(|a, b| a < b));
+        let [on, off] = [&message.suction_on, &message.suction_off].map(time);
+        assert!(Duration::ZERO < on && on < off && off < times[times.len() - 1]);
+        // From home to home, without a jump.
+        let home: Vec<f64> = robot.arm.home.iter().copied().collect();
+        assert_eq!(points[0].positions, home);
+        for (a, b) in points[points.len() - 1].positions.iter().zip(&home) {
+            assert!((a - b).abs() < 1e-6, "{a} {b}");
+        }
+        for pair in points.windows(2) {
+            let steps = pair[0].positions.iter().zip(&pair[1].positions);
+            assert!(steps.into_iter().all(|(a, b)| (a - b).abs() < 0.2));
+        }
+        let refused = robot.rehearse(&proposal(2.0));
+        let message = planned_motion(refused, 8, &names, Header::default()).unwrap();
+        assert!(message.trajectory.points.is_empty() && message.reason.contains("pick"));
         let reason = robot.plan(&proposal(2.0)).unwrap_err();
         assert!(
             reason.contains("pick") && !reason.contains('\n'),

@@ -23,8 +23,9 @@ fn heightmap(sec: i32, height_m: f32) -> Heightmap {
         rows: 4,
         cols: 3,
         pixel_size_m: 0.1,
-        rgb: ByteBuf::from(vec![0; 36]),
+        rgb: ByteBuf::from(vec![100; 36]),
         height_m: vec![height_m; 12],
+        z_max_m: 0.28,
         ..Heightmap::default()
     };
     message.header.stamp = stamp(sec);
@@ -75,6 +76,13 @@ fn confirmation(proposal_id: u64, decision: Decision) -> StepConfirmation {
     }
 }
 
+fn refused(proposal_id: u64, status: u8) -> StepResult {
+    StepResult {
+        proposal_status: status,
+        ..result(proposal_id, StepResult::REFUSED, 21)
+    }
+}
+
 fn result(proposal_id: u64, outcome: u8, sec: i32) -> StepResult {
     let mut message = StepResult {
         proposal_id,
@@ -120,6 +128,7 @@ fn fresh() -> Run {
         nodes: vec!["/camera_fusion".into(), "/suction_executor".into()],
         executor: "/suction_executor".into(),
         stale_after: Duration::from_secs(3),
+        changes: ChangeRules::default(),
     });
     run.on_diagnostics(
         diagnostics("/camera_fusion", "camera front", "ok", "0.5"),
@@ -201,9 +210,110 @@ fn a_refused_advance_asks_again_whether_the_step_succeeded() {
     run.on_result(&result(7, StepResult::DROPPED, 20), NOW)
         .unwrap();
     run.on_confirmation(&confirmation(7, Decision::Retry));
-    run.on_result(&result(7, StepResult::REFUSED, 21), NOW)
-        .unwrap();
+    let mut refusal = ConfirmationRefused {
+        proposal_id: 7,
+        reason: ConfirmationRefused::TWICE,
+        message: "proposal 7: a decision waits for its result already".into(),
+        ..Default::default()
+    };
+    run.on_confirmation_refused(&refusal, NOW);
+    assert_eq!(run.phase(), Phase::AwaitingProposal);
+    refusal.reason = ConfirmationRefused::UNKNOWN;
+    run.on_confirmation_refused(&refusal, NOW);
     assert_eq!(run.phase(), Phase::AwaitingConfirmation);
+    refusal.reason = ConfirmationRefused::STOPPED;
+    run.on_confirmation_refused(&refusal, NOW);
+    assert_eq!(run.phase(), Phase::Stopped);
+    let json = serde_json::to_value(run.snapshot(NOW)).unwrap();
+    let kinds: Vec<_> = json["notices"]
+        .as_array()
+        .unwrap()
+        .iter()
+        .map(|notice| &notice["kind"])
+        .collect();
+    assert_eq!(kinds, ["refusal"; 3]);
+}
+
+#[test]
+fn where_the_executor_says_that_a_proposal_stands_is_where_it_is_shown() {
+    for (status, phase) in [
+        (StepResult::PROPOSAL_PENDING, Phase::Proposed),
+        (StepResult::PROPOSAL_SUPERSEDED, Phase::AwaitingProposal),
+        (StepResult::PROPOSAL_MOVING, Phase::Moving),
+        (StepResult::PROPOSAL_DONE, Phase::AwaitingConfirmation),
+        (StepResult::PROPOSAL_REJECTED, Phase::AwaitingProposal),
+        (StepResult::PROPOSAL_WITHDRAWN, Phase::AwaitingProposal),
+        (0, Phase::Proposed),
+    ] {
+        let mut run = proposed();
+        run.on_confirmation(&confirmation(7, Decision::Approve));
+        run.on_result(&refused(7, status), NOW).unwrap();
+        assert_eq!(run.phase(), phase, "status {status}");
+    }
+    let mut unreadable = result(7, 77, 21);
+    unreadable.proposal_status = 0;
+    let error = proposed().on_result(&unreadable, NOW).unwrap_err();
+    assert!(error.contains("outcome"), "{error}");
+}
+
+#[test]
+fn a_stop_that_only_withdrew_the_proposal_is_no_step() {
+    let mut run = proposed();
+    let mut stopped = result(7, StepResult::STOPPED, 11);
+    stopped.proposal_status = StepResult::PROPOSAL_WITHDRAWN;
+    run.on_result(&stopped, NOW).unwrap();
+    assert_eq!(run.phase(), Phase::Stopped);
+    assert!(run.past_step(1).is_none());
+}
+
+#[test]
+fn a_proposal_made_before_the_table_changed_is_stale_until_the_table_is_as_it_was() {
+    let mut run = proposed();
+    run.on_heightmap(heightmap(11, 0.004), NOW).unwrap();
+    run.check(Decision::Approve, NOW).unwrap();
+    run.on_heightmap(heightmap(12, 0.02), NOW).unwrap();
+    let refusal = run.check(Decision::Approve, NOW).unwrap_err();
+    assert!(refusal.reason.contains("stale"), "{refusal:?}");
+    run.check(Decision::Reject, NOW).unwrap();
+    run.on_heightmap(heightmap(13, 0.0), NOW).unwrap();
+    run.check(Decision::Approve, NOW).unwrap();
+    // A proposal that comes after the change that it has not seen.
+    run.on_heightmap(heightmap(14, 0.02), NOW).unwrap();
+    run.on_proposal(proposal(8, 1, 0, 13)).unwrap();
+    run.check(Decision::Approve, NOW).unwrap_err();
+    run.on_proposal(proposal(9, 1, 0, 14)).unwrap();
+    run.check(Decision::Approve, NOW).unwrap();
+}
+
+#[test]
+fn who_made_a_proposal_and_how_likely_it_succeeds_is_shown() {
+    let mut run = proposed();
+    let shown = |run: &Run| serde_json::to_value(run.snapshot(NOW)).unwrap()["proposal"].clone();
+    assert!(shown(&run)["success_probability"].is_null());
+    let made = PickPlace {
+        success_probability: 0.75,
+        checkpoint: "stacking".into(),
+        author: "gctn_policy".into(),
+        ..proposal(8, 1, 0, 10)
+    };
+    run.on_proposal(made).unwrap();
+    let shown = shown(&run);
+    assert_eq!(shown["success_probability"], 0.75);
+    assert_eq!(
+        (&shown["checkpoint"], &shown["author"]),
+        (&"stacking".into(), &"gctn_policy".into())
+    );
+    let pose = Pose {
+        x_m: 0.1,
+        y_m: 0.2,
+        yaw_rad: 0.0,
+    };
+    let corrected = run.correction(pose, pose, "Ada").unwrap();
+    assert_eq!(
+        (corrected.author.as_str(), corrected.success_probability),
+        ("Ada", -1.0)
+    );
+    assert_eq!(corrected.checkpoint, "");
 }
 
 #[test]
@@ -354,7 +464,9 @@ fn a_correction_is_a_proposal_for_the_present_goal_from_the_newest_view() {
         y_m: 0.2,
         yaw_rad,
     };
-    let corrected = run.correction(pose(0.1, 0.0), pose(0.2, 0.5)).unwrap();
+    let corrected = run
+        .correction(pose(0.1, 0.0), pose(0.2, 0.5), "Ada")
+        .unwrap();
     assert_eq!((corrected.step, corrected.attempt), (1, 0));
     assert_eq!(corrected.header.stamp, stamp(10));
     assert_eq!((corrected.place.x, corrected.place.theta), (0.2, 0.5));
@@ -362,19 +474,25 @@ fn a_correction_is_a_proposal_for_the_present_goal_from_the_newest_view() {
     run.on_proposal(corrected).unwrap();
     assert_eq!((run.phase(), run.current_id()), (Phase::Proposed, Some(id)));
     // The same one again would be taken for a repetition.
-    run.correction(pose(0.1, 0.0), pose(0.2, 0.5)).unwrap_err();
+    run.correction(pose(0.1, 0.0), pose(0.2, 0.5), "Ada")
+        .unwrap_err();
     assert_ne!(
-        run.correction(pose(0.1, 0.0), pose(0.2, 0.6)).unwrap().id,
+        run.correction(pose(0.1, 0.0), pose(0.2, 0.6), "Ada")
+            .unwrap()
+            .id,
         id
     );
-    let refusal = run.correction(pose(9.0, 0.0), pose(0.2, 0.5)).unwrap_err();
+    let refusal = run
+        .correction(pose(9.0, 0.0), pose(0.2, 0.5), "Ada")
+        .unwrap_err();
     assert!(refusal.reason.contains("pick lies outside"), "{refusal:?}");
-    run.correction(pose(0.1, 0.0), pose(f64::NAN, 0.5))
+    run.correction(pose(0.1, 0.0), pose(f64::NAN, 0.5), "Ada")
         .unwrap_err();
 
     // The policy proposes again once the arm has moved; the operator still judges the corrected step.
     run.on_confirmation(&confirmation(id, Decision::Approve));
-    run.correction(pose(0.1, 0.0), pose(0.2, 0.7)).unwrap_err();
+    run.correction(pose(0.1, 0.0), pose(0.2, 0.7), "Ada")
+        .unwrap_err();
     run.on_result(&result(id, StepResult::PLACED, 20), NOW)
         .unwrap();
     run.on_proposal(proposal(9, 1, 0, 21)).unwrap();
@@ -395,4 +513,32 @@ fn a_stop_without_a_proposal_ends_the_run_without_a_refusal() {
     assert_eq!(run.phase(), Phase::Stopped);
     let json = serde_json::to_value(run.snapshot(NOW)).unwrap();
     assert_eq!(json["notices"].as_array().unwrap().len(), 0);
+}
+
+#[test]
+fn the_planned_motion_and_the_scores_of_another_proposal_are_not_shown() {
+    let mut run = proposed();
+    let planned = crate::preview::tests::planned;
+    run.on_planned_motion(planned(6)).unwrap();
+    assert!(run.motion().is_none());
+    run.on_planned_motion(planned(7)).unwrap();
+    assert_eq!(run.motion().unwrap().proposal_id, 7);
+    let scores = |sec| {
+        let mut image = Image {
+            height: 4,
+            width: 6,
+            step: 18,
+            encoding: "rgb8".into(),
+            data: vec![0; 72].into(),
+            ..Default::default()
+        };
+        image.header.stamp = stamp(sec);
+        image
+    };
+    run.on_scores(scores(9)).unwrap();
+    assert!(run.scores().is_none());
+    run.on_scores(scores(10)).unwrap();
+    assert_eq!(run.scores().unwrap().number, 2);
+    run.on_proposal(proposal(8, 1, 0, 11)).unwrap();
+    assert!(run.motion().is_none() && run.scores().is_none());
 }

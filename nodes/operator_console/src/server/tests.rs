@@ -3,6 +3,7 @@ use crate::run::{Run, Watch};
 use crate::session::Sessions;
 use axum::body::to_bytes;
 use axum::http::Method;
+use heightmap::ChangeRules;
 use tower::ServiceExt as _;
 
 const TOKEN: &str = "0123456789abcdef";
@@ -31,6 +32,7 @@ impl Client {
             nodes: Vec::new(),
             executor: "/suction_executor".into(),
             stale_after: Duration::from_secs(3),
+            changes: ChangeRules::default(),
         };
         let sessions = Sessions::new(4, Duration::from_secs(60));
         let console = Arc::new(Console::new(Run::new(watch), sessions));
@@ -41,6 +43,14 @@ impl Client {
             router: router(
                 console,
                 Arc::new(Library::new("no/such/folder".into())),
+                Arc::new(Checkpoints::new(["no/such".into(), "folder".into()])),
+                Arc::new(Trainings::new(
+                    "no/such/program".into(),
+                    "recipe".into(),
+                    "no/such/folder".into(),
+                    "checkpoint".into(),
+                )),
+                Arc::new(Cameras::new(&["front".into()], "world")),
                 access,
                 end.clone(),
             ),
@@ -264,6 +274,10 @@ async fn a_request_that_makes_no_sense_is_refused_with_words() {
     assert_eq!(answer.status, StatusCode::UNAUTHORIZED);
     for path in [
         "/api/v1/heightmaps/present",
+        "/api/v1/cameras/front",
+        "/api/v1/motion",
+        "/api/v1/scores",
+        "/api/v1/robot_description",
         "/api/v1/heightmaps/goal-x",
         "/api/v1/nothing",
         "/../Cargo.toml",
@@ -385,14 +399,23 @@ fn undescribed(
 fn the_description_tells_every_field_of_the_state() {
     let description: serde_json::Value = serde_yaml_ng::from_str(DESCRIPTION).unwrap();
     let console = crate::console::tests::with_everything();
-    let state: serde_json::Value = serde_json::from_str(&console.snapshot().unwrap()).unwrap();
+    let state: serde_json::Value = serde_json::from_str(
+        &console
+            .snapshot(Some(crate::training::tests::state()))
+            .unwrap(),
+    )
+    .unwrap();
     for field in [
         "heightmap",
         "goal",
         "proposal",
         "lesson",
+        "policy",
+        "training",
         "reward",
         "joints",
+        "motion",
+        "scores",
     ] {
         assert!(!state[field].is_null(), "{field}: {state}");
     }

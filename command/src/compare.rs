@@ -1,0 +1,181 @@
+//! `sctn compare`: how far policies are from demonstrated steps.
+
+use crate::root::Root;
+use anyhow::{Context, Result, bail};
+use bags::Demonstration;
+use clap::Args;
+use gctn::{Goal, GoalConditioning, Policy};
+use learning::recorded_run;
+use pick_place::PickPlace;
+use serde::Serialize;
+use std::path::{Path, PathBuf};
+
+/// Arguments of `sctn compare`.
+#[derive(Args)]
+pub struct Compare {
+    /// Checkpoints of the policies
+    #[arg(long, required = true, num_args = 1..)]
+    checkpoints: Vec<PathBuf>,
+    /// Bags with steps that none of them was trained on: demonstrations, taught tasks or recorded runs
+    #[arg(long, required = true, num_args = 1..)]
+    demos: Vec<PathBuf>,
+    /// Print a JSON object last
+    #[arg(long)]
+    json: bool,
+}
+
+/// How far a proposal is from what was demonstrated.
+#[derive(Clone, Copy, Debug, Serialize)]
+struct Distance {
+    pick_m: f64,
+    place_m: f64,
+    /// Between the turns of the object, 0 to pi; an object that looks the same turned may be turned otherwise.
+    turn_rad: f64,
+}
+
+impl Distance {
+    fn between(proposed: &PickPlace, shown: &PickPlace) -> Self {
+        let turn = |action: &PickPlace| action.pick.rotation.rotation_to(&action.place.rotation);
+        Self {
+            pick_m: (proposed.pick.translation.vector - shown.pick.translation.vector).norm(),
+            place_m: (proposed.place.translation.vector - shown.place.translation.vector).norm(),
+            turn_rad: turn(proposed).angle_to(&turn(shown)).abs(),
+        }
+    }
+}
+
+/// A demonstrated step, and how far each policy is from it.
+#[derive(Debug, Serialize)]
+struct Step {
+    demonstration: PathBuf,
+    step: usize,
+    distances: Vec<Distance>,
+}
+
+#[derive(Debug, Serialize)]
+struct Report {
+    checkpoints: Vec<PathBuf>,
+    /// Medians over all steps, for each checkpoint.
+    median: Vec<Distance>,
+    steps: Vec<Step>,
+}
+
+impl Compare {
+    pub fn run(self, _: &Root) -> Result<()> {
+        gctn::set_threads(1);
+        let load = |path: &PathBuf| {
+            Policy::load(path).with_context(|| format!("--checkpoints: {}", path.display()))
+        };
+        let policies = self.checkpoints.iter().map(load);
+        let policies: Vec<_> = policies.collect::<Result<_>>()?;
+        let mut steps = Vec::new();
+        for path in &self.demos {
+            compare(path, &policies, &mut steps)?;
+        }
+        if steps.is_empty() {
+            bail!("--demos: no step that brought the table closer to the goal");
+        }
+        let median = (0..policies.len()).map(|policy| {
+            let middle = |value: fn(&Distance) -> f64| {
+                let mut values: Vec<_> = steps
+                    .iter()
+                    .map(|step| value(&step.distances[policy]))
+                    .collect();
+                values.sort_by(f64::total_cmp);
+                values[values.len() / 2]
+            };
+            Distance {
+                pick_m: middle(|distance| distance.pick_m),
+                place_m: middle(|distance| distance.place_m),
+                turn_rad: middle(|distance| distance.turn_rad),
+            }
+        });
+        let report = Report {
+            median: median.collect(),
+            checkpoints: self.checkpoints,
+            steps,
+        };
+        for (checkpoint, distance) in report.checkpoints.iter().zip(&report.median) {
+            println!(
+                "{}: pick {:.1} mm, place {:.1} mm, turn {:.1} degrees from {} demonstrated steps (median)",
+                checkpoint.display(),
+                1000.0 * distance.pick_m,
+                1000.0 * distance.place_m,
+                distance.turn_rad.to_degrees(),
+                report.steps.len()
+            );
+        }
+        if self.json {
+            println!("{}", serde_json::to_string(&report)?);
+        }
+        Ok(())
+    }
+}
+
+/// Has every policy propose for every step of a demonstration that brought the table closer to the goal.
+fn compare(path: &Path, policies: &[Policy], steps: &mut Vec<Step>) -> Result<()> {
+    let bag =
+        recorded_run(path).with_context(|| format!("--demos: {} holds no bag", path.display()))?;
+    let demonstration = Demonstration::read(&bag)?;
+    // The image before the step: what was seen when the step before it was done.
+    let mut previous = 0;
+    for (index, step) in demonstration.steps.iter().enumerate() {
+        if step.delta_reward <= 0.0 {
+            continue;
+        }
+        let (before, after) = (
+            demonstration.observation(previous),
+            demonstration.observation(index + 1),
+        );
+        previous = index + 1;
+        let distance = |policy: &Policy| {
+            let goal = match policy.config().conditioning {
+                GoalConditioning::Sequence => Goal::step(before, after),
+                GoalConditioning::NextStep => after.into(),
+                other => bail!(
+                    "--checkpoints: a policy is conditioned on {other:?}, expected next_step or sequence"
+                ),
+            };
+            let decision = policy.decide(&step.observation, goal, &[])?;
+            let proposed = PickPlace {
+                pick: decision.pick,
+                place: decision.place,
+            };
+            Ok(Distance::between(&proposed, &step.action))
+        };
+        steps.push(Step {
+            demonstration: path.to_owned(),
+            step: index + 1,
+            distances: policies.iter().map(distance).collect::<Result<_>>()?,
+        });
+    }
+    Ok(())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use nalgebra::{Isometry2, Vector2};
+
+    #[test]
+    fn distances_are_of_places_and_of_the_turn_of_the_object() {
+        let pose = |x, yaw| Isometry2::new(Vector2::new(x, 0.0), yaw);
+        let shown = PickPlace {
+            pick: pose(0.1, 0.0),
+            place: pose(0.2, 0.5),
+        };
+        // The same turn from another yaw of the gripper.
+        let proposed = PickPlace {
+            pick: pose(0.13, 3.0),
+            place: pose(0.24, 3.5),
+        };
+        let distance = Distance::between(&proposed, &shown);
+        assert!((distance.pick_m - 0.03).abs() < 1e-12 && (distance.place_m - 0.04).abs() < 1e-12);
+        assert!(distance.turn_rad < 1e-12, "{distance:?}");
+        let proposed = PickPlace {
+            place: pose(0.24, 2.5),
+            ..proposed
+        };
+        assert!((Distance::between(&proposed, &shown).turn_rad - 1.0).abs() < 1e-12);
+    }
+}

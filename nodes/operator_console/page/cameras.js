@@ -1,0 +1,119 @@
+// What the cameras see, with the proposal drawn on it. Images are fetched while the person looks at them.
+
+import { make, objectAt } from "./view.js";
+
+const PERIOD_MS = 700;
+
+/** World position to pixel, through the lens (plumb_bob); nothing behind the camera. */
+function project({ pose, fx_px, fy_px, cx_px, cy_px, distortion: [k1, k2, p1, p2, k3] }, point) {
+  const to = point.map((value, axis) => value - pose[axis][3]);
+  const [x, y, z] = [0, 1, 2].map((col) => pose[0][col] * to[0] + pose[1][col] * to[1] + pose[2][col] * to[2]);
+  if (z <= 0.01) return null;
+  const [u, v] = [x / z, y / z];
+  const r2 = u * u + v * v;
+  const radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3));
+  return [fx_px * (u * radial + 2 * p1 * u * v + p2 * (r2 + 2 * u * u)) + cx_px, fy_px * (v * radial + p1 * (r2 + 2 * v * v) + 2 * p2 * u * v) + cy_px];
+}
+
+/** Height of the heightmap's cell under a position [m]. */
+function heightAt(map, picture, { x_m, y_m }) {
+  const [row, col] = [Math.floor((y_m - map.origin_y_m) / map.pixel_size_m), Math.floor((x_m - map.origin_x_m) / map.pixel_size_m)];
+  return picture.height_m[row * map.cols + col] ?? 0;
+}
+
+function drawOn(context, camera, map, picture, { pick, place }) {
+  const [pickAt, placeAt] = [[pick.x_m, pick.y_m, heightAt(map, picture, pick)], [place.x_m, place.y_m, heightAt(map, picture, place)]];
+  const turn = place.yaw_rad - pick.yaw_rad;
+  const [cos, sin] = [Math.cos(turn), Math.sin(turn)];
+  const trace = (points) => {
+    const pixels = points.map((point) => project(camera, point));
+    if (pixels.includes(null)) return false;
+    context.beginPath();
+    pixels.forEach(([x, y], index) => (index ? context.lineTo(x, y) : context.moveTo(x, y)));
+    return true;
+  };
+  const line = (points, color) => {
+    if (!trace(points)) return;
+    context.strokeStyle = "#000b";
+    context.lineWidth = 7;
+    context.stroke();
+    context.strokeStyle = color;
+    context.lineWidth = 3;
+    context.stroke();
+  };
+  // The object at its new pose, on what lies there.
+  context.fillStyle = "#5cd6c066";
+  for (const [row, first, last] of objectAt(map, picture, pick.x_m, pick.y_m)) {
+    const corner = (r, c) => {
+      const [x, y] = [c * map.pixel_size_m, r * map.pixel_size_m];
+      return [place.x_m + cos * x - sin * y, place.y_m + sin * x + cos * y, placeAt[2]];
+    };
+    if (trace([corner(row, first), corner(row, last), corner(row + 1, last), corner(row + 1, first)])) context.fill();
+  }
+  const ring = Array.from({ length: 25 }, (_, index) => {
+    const angle = (2 * Math.PI * index) / 24;
+    return [pickAt[0] + 0.016 * Math.cos(angle), pickAt[1] + 0.016 * Math.sin(angle), pickAt[2]];
+  });
+  const arm = (x, y) => [placeAt[0] + x, placeAt[1] + y, placeAt[2]];
+  line(ring, "#ffd166");
+  line([arm(-0.02, 0), arm(0.02, 0)], "#5cd6c0");
+  line([arm(0, -0.02), arm(0, 0.02)], "#5cd6c0");
+  line([arm(0, 0), arm(0.05 * cos, 0.05 * sin)], "#5cd6c0");
+}
+
+/** The camera views in a `details` element. */
+export class CameraViews {
+  #api;
+  #details;
+  #list;
+  #views = new Map();
+  #proposal = null;
+  #shown = "";
+  #timer = 0;
+
+  constructor(api, details, list) {
+    [this.#api, this.#details, this.#list] = [api, details, list];
+    details.addEventListener("toggle", () => this.#poll());
+  }
+
+  /** What is drawn on the images: the heightmap, its picture, and pick and place; nothing without a proposal. */
+  show(map, picture, proposal) {
+    const shown = JSON.stringify([picture?.number, proposal?.pick, proposal?.place]);
+    if (shown === this.#shown) return;
+    this.#shown = shown;
+    this.#proposal = map && picture && proposal?.pick && proposal.place ? { map, picture, proposal } : null;
+    for (const view of this.#views.values()) this.#draw(view);
+  }
+
+  async #poll() {
+    clearTimeout(this.#timer);
+    if (!this.#details.open) return;
+    const cameras = await this.#api.get("cameras").catch(() => []);
+    for (const camera of cameras) {
+      let view = this.#views.get(camera.name);
+      if (!view) {
+        const canvas = make("canvas", {});
+        canvas.setAttribute("role", "img");
+        canvas.setAttribute("aria-label", `What the ${camera.name} camera sees`);
+        view = { canvas, number: 0 };
+        this.#views.set(camera.name, view);
+        this.#list.append(make("figure", {}, make("figcaption", { textContent: `Camera ${camera.name}` }), canvas));
+      }
+      view.camera = camera;
+      if (camera.number !== view.number) {
+        const image = await this.#api.image(`cameras/${camera.name}`).catch(() => null);
+        if (image) Object.assign(view, image);
+        this.#draw(view);
+      }
+    }
+    this.#timer = setTimeout(() => this.#poll(), PERIOD_MS);
+  }
+
+  #draw({ canvas, image, camera }) {
+    if (!image) return;
+    [canvas.width, canvas.height] = [image.width, image.height];
+    const context = canvas.getContext("2d");
+    context.putImageData(image, 0, 0);
+    if (this.#proposal && camera.pose) drawOn(context, camera, this.#proposal.map, this.#proposal.picture, this.#proposal.proposal);
+  }
+}

@@ -1,0 +1,227 @@
+"""The operator's console killed, fuzzed, watched by many and by somebody slow. The long forms are commands:
+
+MOMENTS=50 SECONDS=60 VIEWING_S=600 .venv/bin/python -m pytest tests/test_console_robustness.py
+"""
+
+from __future__ import annotations
+
+import http.client
+import os
+import pathlib
+import random
+import signal
+import time
+import urllib.parse
+from collections.abc import Callable
+
+from cell_operator import EVENT, Operator
+from console_peer import ROUTES, WebSocket, post, spoiled
+from processes import Process
+from sctn_msgs.msg import StepConfirmation, StepResult
+from sctn_msgs.srv import ResetCell
+from test_operator_console import CLIENT, as_arguments, slow_down, until
+
+# Moments of a motion at which the console is killed.
+MOMENTS = int(os.environ.get("MOMENTS", "3"))
+# How long input is fuzzed.
+SECONDS = float(os.environ.get("SECONDS", "4"))
+# How long ten viewers watch.
+VIEWING_S = float(os.environ.get("VIEWING_S", "4"))
+
+# The executor's presence_timeout_s, and what the arm needs to come to rest.
+STOPS_WITHIN_S = 3.0
+
+
+def console_process(start: Callable[..., Process], address_file: pathlib.Path) -> tuple[Process, str]:
+    """A console beside a graph that runs, and its address."""
+    address_file.unlink(missing_ok=True)
+    parameters = {"port": 0, "address_file": address_file, "use_sim_time": "true"}
+    process = start("operator_console", "--ros-args", *as_arguments(parameters))
+    until(address_file.exists, "address of the page", 30.0)
+    return process, address_file.read_text().strip()
+
+
+def approvable(console: CLIENT.Console, since: str | None = None) -> dict:
+    """Goes on with the run until another proposal than `since` can be approved, and returns it."""
+
+    def ready() -> dict | None:
+        console.post("presence")
+        state = console.state()
+        phase = state["phase"]
+        try:
+            if phase in ("awaiting_confirmation", "fault"):
+                console.decide("retry", state["proposal"])
+            elif phase == "stopped":
+                console.post("step", step=state["goal"]["step"])
+                time.sleep(0.5)
+            elif phase == "proposed" and state["proposal"]["id"] == since:
+                # It was approved by a console that is no more: the executor says what became of it.
+                console.decide("approve", state["proposal"])
+            elif phase == "proposed" and "approve" not in state["refused"]:
+                return state["proposal"]
+        except CLIENT.Refused:
+            time.sleep(0.1)
+        return None
+
+    return until(ready, "proposal that can be approved", 60.0)
+
+
+def motion_result(operator: Operator, proposal_id: str) -> StepResult | None:
+    """What became of the motion of a proposal; refusals of repeated confirmations are left out."""
+    results = operator.received["step_result"]
+    return next((one for one in results if str(one.proposal_id) == proposal_id and one.outcome != StepResult.REFUSED), None)
+
+
+def reset(operator: Operator, name: str) -> None:
+    """The cell as it was at first."""
+    client = operator.node.create_client(ResetCell, "sim_workcell/reset")
+    operator.until(client.service_is_ready, "sim_workcell", 30.0)
+    answer = client.call_async(ResetCell.Request(request_id=name, seed=10012))
+    operator.until(answer.done, "answer of sim_workcell", 30.0)
+    assert answer.result().success, answer.result().message
+
+
+def test_no_motion_goes_on_unattended_after_the_console_is_killed_and_the_run_goes_on(
+    start, operator: Operator, tmp_path: pathlib.Path
+) -> None:
+    start("sctn", "launch", "--problem", "stacking", "--seed", 10012, "--operator", "none", "--require-presence")
+    generator = random.Random(5)
+    since = None
+    stopped = 0
+    for moment in range(MOMENTS):
+        process, address = console_process(start, tmp_path / "address")
+        console = CLIENT.Console(address, f"Ada {moment}")
+        console.take_control()
+        if not moment:
+            slow_down(operator, 1.0)
+        proposal = approvable(console, since)
+        # The executor hears that somebody is present.
+        console.post("presence")
+        operator.spin(0.5)
+        console.decide("approve", proposal)
+        since = proposal["id"]
+        # From before the arm moves until its way home.
+        moment_s = time.monotonic() + generator.uniform(0.0, 4.0)
+        while time.monotonic() < moment_s:
+            console.post("presence")
+            time.sleep(0.1)
+        process.signal(signal.SIGKILL)
+        killed = time.monotonic()
+        result = operator.until(lambda since=since: motion_result(operator, since), "result of the motion", 30.0)
+        if result.outcome == StepResult.STOPPED:
+            stopped += 1
+            assert time.monotonic() - killed < STOPS_WITHIN_S
+        # Nothing moves from then on.
+        operator.spin(0.3)
+        still = operator.newest("joint_states").position
+        operator.spin(0.7)
+        assert max(abs(a - b) for a, b in zip(still, operator.newest("joint_states").position, strict=True)) < 1e-3
+        # Somebody takes what the gripper holds, and brings the arm home.
+        reset(operator, f"after moment {moment}")
+    assert stopped > 0
+    # The run goes on with another console.
+    slow_down(operator, 0.0)
+    _, address = console_process(start, tmp_path / "address")
+    console = CLIENT.Console(address, "Bob")
+    console.take_control()
+    console.decide("approve", approvable(console, since))
+    console.wait("awaiting_confirmation")
+
+
+def resident_kb(process: Process) -> int:
+    """Resident memory."""
+    status = pathlib.Path(f"/proc/{process.pid}/status").read_text()
+    return int(next(line for line in status.splitlines() if line.startswith("VmRSS")).split()[1])
+
+
+def test_random_input_of_somebody_with_the_token_moves_nothing_and_the_page_works_on(
+    start, operator: Operator, tmp_path: pathlib.Path
+) -> None:
+    start("sctn", "launch", "--problem", "stacking", "--seed", 10014, "--operator", "none")
+    process, address = console_process(start, tmp_path / "address")
+    ada, eve = CLIENT.Console(address, "Ada"), CLIENT.Console(address, "Eve")
+    ada.take_control()
+    proposal = approvable(ada)
+    said: list[StepConfirmation] = []
+    operator.node.create_subscription(StepConfirmation, "step_confirmation", said.append, EVENT)
+    operator.until(lambda: operator.count("pick_place"), "proposal", 30.0)
+    proposals = operator.count("pick_place")
+    seed = random.randrange(2**32)
+    print(f"seed {seed}")
+    generator = random.Random(seed)
+    url = urllib.parse.urlsplit(address)
+    connection = http.client.HTTPConnection(url.netloc, timeout=10)
+    # Whoever sends this has the token and a session, and does not decide.
+    headers = {**eve._headers, "Content-Type": "application/json"}
+    end = time.monotonic() + SECONDS
+    requests, messages = 0, 0
+    watcher: WebSocket | None = None
+    while time.monotonic() < end:
+        path = generator.choice(list(ROUTES))
+        status = post(connection, headers, path, spoiled(generator, ROUTES[path]))
+        assert status < 500, f"seed {seed}: {path} answered {status}"
+        requests += 1
+        try:
+            watcher = watcher or WebSocket(address, eve._headers["X-Session"])
+            data = generator.choice(
+                [b"", b"{}", generator.randbytes(50), b"[" * 3000, b"x" * 5000, b'{"type": "present", "visible": 1}', b'{"type": "hello"}']
+            )
+            watcher.send(data, generator.choice([1, 2, 9, 10, 8, 3]))
+            messages += 1
+        except OSError:
+            watcher = None
+    print(f"{requests} requests, {messages} messages")
+    assert requests > 100 and messages > 50
+    assert process.exit_code is None
+    ada.post("presence")
+    assert ada.state()["operator"] == ada.viewer
+    assert ada.state()["proposal"]["id"] == proposal["id"]
+    operator.spin(0.5)
+    assert said == [] and operator.count("pick_place") == proposals
+    ada.decide("approve", approvable(ada))
+    ada.wait("awaiting_confirmation")
+
+
+def test_ten_viewers_and_a_slow_one_cost_no_memory_and_slow_nobody(start, tmp_path: pathlib.Path) -> None:
+    start("sctn", "launch", "--problem", "stacking", "--seed", 10016, "--operator", "none")
+    process, address = console_process(start, tmp_path / "address")
+    ada = CLIENT.Console(address, "Ada")
+    ada.take_control()
+    proposal = approvable(ada)
+
+    def presence_s() -> float:
+        begin = time.monotonic()
+        ada.post("presence")
+        return time.monotonic() - begin
+
+    sessions = [CLIENT.Console(address, f"Viewer {number}")._headers["X-Session"] for number in range(10)]
+    viewers = [WebSocket(address, session) for session in sessions]
+    # It reads nothing, and its buffer is small.
+    slow = WebSocket(address, ada._headers["X-Session"], receive_buffer=4096)
+    took: list[float] = []
+
+    def watch(seconds: float) -> None:
+        end = time.monotonic() + seconds
+        while time.monotonic() < end:
+            for viewer in viewers:
+                viewer.send(b'{"type": "present", "visible": true}')
+            seen = [viewer.receive() for viewer in viewers]
+            assert {state["proposal"]["id"] for state in seen} == {proposal["id"]}
+            took.append(presence_s())
+
+    watch(2.0)
+    before_kb = resident_kb(process)
+    took.clear()
+    watch(VIEWING_S)
+    grown_kb = resident_kb(process) - before_kb
+    took.sort()
+    median_s = took[len(took) // 2]
+    print(f"{len(took)} rounds of ten viewers: {grown_kb} kB more")
+    print(f"a request takes {1000 * median_s:.1f} ms (median), {1000 * took[-1]:.1f} ms (longest)")
+    assert grown_kb < 4096
+    assert median_s < 0.05
+    slow.close()
+    for viewer in viewers:
+        viewer.close()
+    ada.decide("approve", approvable(ada))
+    ada.wait("awaiting_confirmation")

@@ -57,7 +57,8 @@ def approvable(console: CLIENT.Console, since: str | None = None) -> dict:
             elif phase == "proposed" and state["proposal"]["id"] == since:
                 # It was approved by a console that is no more: the executor says what became of it.
                 console.decide("approve", state["proposal"])
-            elif phase == "proposed" and "approve" not in state["refused"]:
+            elif phase == "proposed" and "approve" not in state["refused"] and state["motion"] is not None:
+                # The executor knows the proposal: it has planned its motion.
                 return state["proposal"]
         except CLIENT.Refused:
             time.sleep(0.1)
@@ -85,6 +86,7 @@ def test_no_motion_goes_on_unattended_after_the_console_is_killed_and_the_run_go
     start, operator: Operator, tmp_path: pathlib.Path
 ) -> None:
     start("sctn", "launch", "--problem", "stacking", "--seed", 10012, "--operator", "none", "--require-presence")
+    operator.until(operator.executor_is_ready, "executor that has checked its driver", 60.0)
     generator = random.Random(5)
     since = None
     stopped = 0

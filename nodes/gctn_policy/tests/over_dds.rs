@@ -35,7 +35,7 @@ fn network() -> NetworkConfig {
     }
 }
 
-/// Some scene; another `salt` is another scene.
+/// A scene with a box of 5 x 8 cells; another `salt` is a box elsewhere.
 fn heightmap(cells: usize, stamp_s: u64, salt: usize) -> Heightmap {
     let workspace = Workspace {
         rows: cells,
@@ -47,7 +47,9 @@ fn heightmap(cells: usize, stamp_s: u64, salt: usize) -> Heightmap {
         *byte = (index * (2 * salt + 3) % 251) as u8;
     }
     for (index, height_m) in heightmap.height_m.iter_mut().enumerate() {
-        *height_m = (index * (salt + 1) % 17) as f32 / 100.0;
+        let (row, col) = (index / cells, index % cells);
+        let is_box = (4..12).contains(&row) && (5 * salt..5 * salt + 5).contains(&col);
+        *height_m = if is_box { 0.03 } else { 0.0 };
     }
     let header = convert::header(Duration::from_secs(stamp_s), "world").unwrap();
     convert::heightmap_to_msg(heightmap, header, 3, 1.0).unwrap()

@@ -343,7 +343,7 @@ def test_a_program_approves_a_step_and_is_refused_what_is_stale(start, decided) 
     assert 0.01 < max(heights_m) < 0.3
     until(lambda: "approve" not in console.state()["refused"], "fresh streams", 30.0)
     # The executor plans after the policy has proposed.
-    until(lambda: console.state()["motion"] is not None, "planned motion", 30.0)
+    until(lambda: (console.state()["motion"] or {}).get("duration_s"), "planned motion", 30.0)
     first = console.state()
     assert (first["proposal"]["author"], first["proposal"]["checkpoint"]) == ("gctn_policy", "ten_problems")
     motion = json.loads(console._request("motion")[0])

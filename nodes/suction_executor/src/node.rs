@@ -30,7 +30,7 @@ use crate::driver::{DriverError, DriverRobot, Link};
 use crate::home::go_home;
 use crate::parameters::SuctionExecutorParameters;
 use crate::presence::Presence;
-use crate::rehearsal::{RobotNow, planned_motion};
+use crate::rehearsal::{PlannedPrimitive, RobotNow, planned_motion};
 use crate::status::DriverStatus;
 use crate::stop_memory::StopMemory;
 use crate::surface::touchdown;
@@ -111,6 +111,7 @@ impl Active for ExecutorNode {
             )),
             results: &self.results,
             planned: &self.planned,
+            unplanned: None,
             home: node.service_server("~/home")?,
             home_calls: Vec::new(),
             goals: node.action_server("execute_pick_place")?,
@@ -176,6 +177,8 @@ struct Executor<'a> {
     presence: Presence,
     results: &'a Publisher<sctn_msgs::StepResult>,
     planned: &'a Publisher<sctn_msgs::PlannedMotion>,
+    /// The pending proposal, while its motion could not be planned.
+    unplanned: Option<Proposal>,
     home: ServiceServer<Trigger>,
     /// Calls of `home` to be answered when the arm is there.
     home_calls: Vec<RequestId>,
@@ -216,7 +219,10 @@ impl Executor<'_> {
                 Some(phase) = self.phases.recv() => self.say_phase(phase),
                 (cause, stopped, ended) = end_of(&mut self.motion) => self.on_end(cause, stopped, ended),
                 () = sleep_until(deadline) => self.ask_again(),
-                _ = diagnostics.tick() => self.diagnose(),
+                _ = diagnostics.tick() => {
+                    self.diagnose();
+                    self.plan_again();
+                }
                 Ok(()) = changes.changed() => {
                     self.parameters = changes.borrow_and_update().clone();
                     self.gate.set_rules(rules(&self.parameters));
@@ -294,6 +300,7 @@ impl Executor<'_> {
             Ok(seen) => {
                 self.seen = Some((Arc::clone(&seen.heightmap), seen.stamp));
                 self.gate.on_heightmap(seen.stamp, seen.heightmap);
+                self.plan_again();
                 self.ask_again();
             }
             Err(error) => self.heightmaps.reject(error),
@@ -306,7 +313,7 @@ impl Executor<'_> {
         match self.gate.on_proposal(id, proposal.clone()) {
             Proposed::Pending => {
                 info!("proposal {id}");
-                self.show_plan(proposal.as_ref());
+                self.show_plan(proposal.ok());
                 if self.gate.moves_unasked(id) {
                     self.confirm(id, OperatorDecision::Approve);
                 }
@@ -323,20 +330,37 @@ impl Executor<'_> {
         self.ask_again();
     }
 
-    /// Publishes how a pending proposal would be carried out.
-    fn show_plan(&self, proposal: Result<&Proposal, &String>) {
-        let Ok(proposal) = proposal else {
+    /// Publishes how a pending proposal would be carried out, or why it cannot be; in the latter case once more when it can.
+    fn show_plan(&mut self, proposal: Option<Proposal>) {
+        let Some(proposal) = proposal else {
             return;
         };
+        let planned = self.robot().rehearse(&proposal);
+        let is_planned = planned.is_ok();
+        self.publish_plan(planned, proposal.id);
+        self.unplanned = (!is_planned).then_some(proposal);
+    }
+
+    /// The robot's state or a heightmap may have arrived since the last plan failed.
+    fn plan_again(&mut self) {
+        let proposal = self.unplanned.take_if(|_| self.motion.is_none());
+        let Some(proposal) = proposal else {
+            return;
+        };
+        match self.robot().rehearse(&proposal) {
+            Ok(planned) => self.publish_plan(Ok(planned), proposal.id),
+            Err(_) => self.unplanned = Some(proposal),
+        }
+    }
+
+    fn publish_plan(&self, planned: Result<PlannedPrimitive, String>, id: ProposalId) {
         let header = msgs::std_msgs::Header {
             stamp: self.node.now(),
             frame_id: self.parameters.world_frame.clone(),
         };
-        let planned = self.robot().rehearse(proposal);
-        let names = &self.work_cell.joint_names;
-        match planned_motion(planned, proposal.id.0, names, header) {
+        match planned_motion(planned, id.0, &self.work_cell.joint_names, header) {
             Ok(motion) => self.planned.publish(motion),
-            Err(error) => warn!("the motion of proposal {}: {error}", proposal.id),
+            Err(error) => warn!("the motion of proposal {id}: {error}"),
         }
     }
 
@@ -357,7 +381,7 @@ impl Executor<'_> {
                 let proposal = read_proposal(&new.goal.proposal);
                 let proposed = self.gate.on_proposal(id, proposal.clone());
                 if matches!(proposed, Proposed::Pending) {
-                    self.show_plan(proposal.as_ref());
+                    self.show_plan(proposal.ok());
                 }
                 match proposed {
                     Proposed::Invalid(reason) => Err(reason.to_string()),

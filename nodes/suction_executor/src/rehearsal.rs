@@ -20,19 +20,19 @@ use crate::surface::touchdown;
 struct Rehearsal {
     joints: Joints,
     holds: bool,
-    motion: Motion,
+    motion: PlannedPrimitive,
 }
 
 /// The whole motion of a proposal, from where the arm stands until it is home.
 #[derive(Clone, Debug, Default, PartialEq)]
-pub(crate) struct Motion {
+pub(crate) struct PlannedPrimitive {
     /// Times are from the beginning and increase.
     points: Vec<TrajectoryPoint>,
     /// When suction is switched on, and when off.
     suction: [Duration; 2],
 }
 
-impl Motion {
+impl PlannedPrimitive {
     fn end(&self) -> Duration {
         self.points
             .last()
@@ -52,14 +52,14 @@ impl Motion {
 
 /// The message that shows a proposal's motion, or why there is none.
 pub(crate) fn planned_motion(
-    planned: Result<Motion, String>,
+    planned: Result<PlannedPrimitive, String>,
     proposal_id: u64,
     joint_names: &[String; 6],
     header: Header,
 ) -> Result<sctn_msgs::PlannedMotion, ConvertError> {
     let (motion, reason) = match planned {
         Ok(motion) => (motion, String::new()),
-        Err(reason) => (Motion::default(), reason),
+        Err(reason) => (PlannedPrimitive::default(), reason),
     };
     let point = |point: &TrajectoryPoint| {
         Ok::<_, ConvertError>(trajectory_msgs::JointTrajectoryPoint {
@@ -167,14 +167,14 @@ impl RobotState for RobotNow {
 
 impl RobotNow {
     /// The motion of a proposal from where the robot is; else why it cannot be planned.
-    pub fn rehearse(&self, proposal: &Proposal) -> Result<Motion, String> {
+    pub fn rehearse(&self, proposal: &Proposal) -> Result<PlannedPrimitive, String> {
         let (Some(joints), Some(pins)) = (&self.status.joints, &self.status.pins) else {
             return Err("the robot's state is not known".into());
         };
         let mut robot = Rehearsal {
             joints: joints.value.positions_rad,
             holds: pins.value.vacuum,
-            motion: Motion::default(),
+            motion: PlannedPrimitive::default(),
         };
         let Proposal {
             action, settings, ..

@@ -18,7 +18,7 @@ use msgs::{
     rcl_interfaces::{GetParameters, SetParameters},
     sctn_msgs::{
         CaptureGoal, ExecutePickPlace, ExecutePickPlaceFeedback, ExecutePickPlaceResult,
-        LoadDemonstration, ResetCell, Reward, SetStep,
+        LoadCheckpoint, LoadDemonstration, ResetCell, Reward, SetStep,
     },
     to_cdr,
 };
@@ -53,6 +53,7 @@ impl Active for Echo {
         service::<GetParameters>(node)?;
         service::<SetParameters>(node)?;
         service::<CaptureGoal>(node)?;
+        service::<LoadCheckpoint>(node)?;
         service::<LoadDemonstration>(node)?;
         service::<ResetCell>(node)?;
         service::<SetStep>(node)?;

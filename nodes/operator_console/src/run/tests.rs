@@ -1,7 +1,9 @@
 use super::*;
+use msgs::diagnostic_msgs::DiagnosticArray;
 use msgs::diagnostic_msgs::{DiagnosticStatus, KeyValue};
 use msgs::geometry_msgs::Pose2D;
 use msgs::sctn_msgs::PrimitiveSettings;
+use msgs::sctn_msgs::{ConfirmationRefused, StepConfirmation, StepResult};
 use serde_bytes::ByteBuf;
 
 const SETTINGS: PrimitiveSettings = PrimitiveSettings {

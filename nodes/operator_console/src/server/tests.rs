@@ -1,8 +1,12 @@
 use super::*;
 use crate::run::{Run, Watch};
 use crate::session::Sessions;
+use axum::body::Body;
 use axum::body::to_bytes;
+use axum::extract::Request;
+use axum::http::HeaderMap;
 use axum::http::Method;
+use axum::http::header::CONTENT_SECURITY_POLICY;
 use heightmap::ChangeRules;
 use tower::ServiceExt as _;
 

@@ -1,0 +1,318 @@
+use super::*;
+use crate::run::Watch;
+use msgs::sctn_msgs::{Goal, PrimitiveSettings};
+
+fn heightmap() -> Heightmap {
+    Heightmap {
+        rows: 1,
+        cols: 1,
+        pixel_size_m: 1.0,
+        z_max_m: 1.0,
+        rgb: vec![0; 3].into(),
+        height_m: vec![0.0],
+        ..Heightmap::default()
+    }
+}
+
+/// An active console with an open proposal 7 and an operator, and what it commands.
+fn proposed() -> (Console, ViewerId, mpsc::UnboundedReceiver<Command>) {
+    let watch = Watch {
+        nodes: Vec::new(),
+        executor: "/suction_executor".into(),
+        stale_after: Duration::from_secs(3),
+        changes: heightmap::ChangeRules::default(),
+    };
+    let sessions = Sessions::new(4, Duration::from_secs(60));
+    let console = Console::new(Run::new(watch), sessions);
+    let commands = console.connect();
+    let ada = console.change(|state, now| {
+        let ada = state.sessions.join("Ada", "key".into(), now).unwrap();
+        state.sessions.take(ada, None).unwrap();
+        state.run.on_joints(Vec::new(), Vec::new(), now);
+        state.on_heightmap(heightmap(), now).unwrap();
+        let goal = Goal {
+            step: 1,
+            step_count: 1,
+            heightmap: heightmap(),
+            ..Goal::default()
+        };
+        state.run.on_goal(goal, now).unwrap();
+        let settings = PrimitiveSettings {
+            clearance_m: 0.1,
+            lift_m: 0.1,
+            travel_m_s: 1.0,
+            carry_m_s: 1.0,
+            descend_m_s: 0.1,
+            acceleration_m_s2: 1.0,
+        };
+        let proposal = PickPlace {
+            id: 7,
+            step: 1,
+            settings,
+            ..PickPlace::default()
+        };
+        state.run.on_proposal(proposal).unwrap();
+        ada
+    });
+    (console, ada, commands)
+}
+
+/// A console whose state has something in every field.
+pub(crate) fn with_everything() -> Console {
+    let (console, ada, commands) = proposed();
+    decide(&console, ada, 7, Decision::Approve).unwrap();
+    let mut result = StepResult {
+        proposal_id: 7,
+        outcome: StepResult::FAULT,
+        reason: "protective stop".into(),
+        ..StepResult::default()
+    };
+    result.duration.sec = 1;
+    console.change(|state, now| {
+        state.on_result(&result, now).unwrap();
+        state.on_heightmap(heightmap(), now).unwrap();
+        state.run.on_reward(Default::default());
+        let planned = crate::preview::tests::planned(7);
+        state.run.on_planned_motion(planned).unwrap();
+        let scores = msgs::sensor_msgs::Image {
+            height: 1,
+            width: 2,
+            step: 6,
+            encoding: "rgb8".into(),
+            data: vec![0; 6].into(),
+            ..Default::default()
+        };
+        state.run.on_scores(scores).unwrap();
+        let status = msgs::diagnostic_msgs::DiagnosticStatus {
+            name: "/gctn_policy: policy".into(),
+            ..Default::default()
+        };
+        let diagnostics = msgs::diagnostic_msgs::DiagnosticArray {
+            status: vec![status],
+            ..Default::default()
+        };
+        state.run.on_diagnostics(diagnostics, now);
+        state
+            .run
+            .on_joints(vec!["elbow_joint".into()], vec![1.0], now);
+        state.policy = Some(PolicyState {
+            checkpoint: "new.safetensors".into(),
+            previous: "old.safetensors".into(),
+        });
+        state.begin_lesson(ada).unwrap();
+    });
+    drop(commands);
+    console
+}
+
+fn decide(console: &Console, viewer: ViewerId, id: u64, decision: Decision) -> Result<(), Refusal> {
+    console.change(|state, now| state.decide(viewer, id, decision, now))
+}
+
+#[test]
+fn an_approval_is_sent_once_with_the_name_of_who_decides() {
+    let (console, ada, mut commands) = proposed();
+    decide(&console, ada, 7, Decision::Approve).unwrap();
+    let Ok(Command::Confirm(confirmation)) = commands.try_recv() else {
+        panic!("expected a confirmation");
+    };
+    assert_eq!(confirmation.operator_name, "Ada");
+    assert_eq!(
+        (confirmation.proposal_id, confirmation.decision),
+        (7, StepConfirmation::APPROVE)
+    );
+    // A second click, or a replayed request.
+    let refusal = decide(&console, ada, 7, Decision::Approve).unwrap_err();
+    assert!(refusal.reason.contains("moving"), "{refusal:?}");
+    assert!(commands.try_recv().is_err());
+}
+
+#[test]
+fn the_operator_changes_the_policy_and_goes_back() {
+    let (console, ada, mut commands) = proposed();
+    let back = || console.change(|state, _| state.use_previous_checkpoint(ada));
+    assert!(back().unwrap_err().reason.contains("not changed"));
+    let bob = console.change(|state, now| state.sessions.join("Bob", "b".into(), now).unwrap());
+    let load =
+        |viewer| console.change(|state, _| state.use_checkpoint(viewer, "new.safetensors".into()));
+    load(bob).unwrap_err();
+    load(ada).unwrap();
+    let expected = Command::LoadCheckpoint("new.safetensors".into(), "Ada".into());
+    assert_eq!(commands.try_recv().unwrap(), expected);
+    console.change(|state, _| {
+        state.policy = Some(PolicyState {
+            checkpoint: "new.safetensors".into(),
+            previous: "old.safetensors".into(),
+        });
+    });
+    back().unwrap();
+    let expected = Command::LoadCheckpoint("old.safetensors".into(), "Ada".into());
+    assert_eq!(commands.try_recv().unwrap(), expected);
+}
+
+#[test]
+fn a_decision_on_another_proposal_than_the_present_one_is_refused() {
+    let (console, ada, mut commands) = proposed();
+    let refusal = decide(&console, ada, 6, Decision::Approve).unwrap_err();
+    assert!(refusal.reason.contains("Proposal 6"), "{refusal:?}");
+    assert!(commands.try_recv().is_err());
+}
+
+#[test]
+fn everybody_may_stop_and_only_the_operator_does_anything_else() {
+    let (console, _, mut commands) = proposed();
+    let bob = console.change(|state, now| state.sessions.join("Bob", "b".into(), now).unwrap());
+    assert!(decide(&console, bob, 7, Decision::Approve).is_err());
+    assert!(console.change(|state, _| state.home(bob)).is_err());
+    assert!(console.change(|state, _| state.set_step(bob, 1)).is_err());
+    assert!(commands.try_recv().is_err());
+    decide(&console, bob, 0, Decision::Stop).unwrap();
+    assert!(matches!(commands.try_recv(), Ok(Command::Confirm(_))));
+}
+
+#[test]
+fn our_own_confirmation_that_comes_back_late_changes_nothing() {
+    let (console, ada, mut commands) = proposed();
+    decide(&console, ada, 7, Decision::Approve).unwrap();
+    let Ok(Command::Confirm(confirmation)) = commands.try_recv() else {
+        panic!("expected a confirmation");
+    };
+    let refused = StepResult {
+        proposal_id: 7,
+        outcome: StepResult::REFUSED,
+        proposal_status: StepResult::PROPOSAL_PENDING,
+        ..Default::default()
+    };
+    console
+        .change(|state, now| state.on_result(&refused, now))
+        .unwrap();
+    console.change(|state, _| state.on_confirmation(&confirmation));
+    decide(&console, ada, 7, Decision::Approve).unwrap();
+}
+
+#[test]
+fn a_motion_that_stops_by_itself_stops_the_run_for_everybody() {
+    let (console, ada, mut commands) = proposed();
+    decide(&console, ada, 7, Decision::Approve).unwrap();
+    commands.try_recv().unwrap();
+    let mut stopped = StepResult {
+        proposal_id: 7,
+        outcome: StepResult::STOPPED,
+        ..StepResult::default()
+    };
+    stopped.duration.sec = 1;
+    console
+        .change(|state, now| state.on_result(&stopped, now))
+        .unwrap();
+    let Ok(Command::Confirm(stop)) = commands.try_recv() else {
+        panic!("expected a stop");
+    };
+    assert_eq!(stop.decision, StepConfirmation::STOP);
+    // One stop is enough, and an operator's own needs no other.
+    console
+        .change(|state, now| state.on_result(&stopped, now))
+        .unwrap();
+    assert!(commands.try_recv().is_err());
+}
+
+#[test]
+fn an_inactive_console_refuses_what_it_could_not_pass_on() {
+    let (console, ada, commands) = proposed();
+    drop(commands);
+    let refusal = decide(&console, ada, 7, Decision::Approve).unwrap_err();
+    assert!(refusal.reason.contains("not active"), "{refusal:?}");
+}
+
+#[test]
+fn a_lesson_is_shown_judged_taken_back_and_becomes_a_demonstration() {
+    let (console, ada, mut commands) = proposed();
+    let pose = |x_m| Pose {
+        x_m,
+        y_m: 0.5,
+        yaw_rad: 0.0,
+    };
+    let settings = convert::settings_to_msg(&pick_place::PrimitiveSettings::RIGID);
+    let show = |console: &Console| {
+        console.change(|state, now| state.show_step(ada, pose(0.2), pose(0.8), settings, now))
+    };
+    show(&console).unwrap_err();
+    console.change(|state, _| state.begin_lesson(ada)).unwrap();
+    let refusal = decide(&console, ada, 7, Decision::Approve).unwrap_err();
+    assert!(refusal.reason.contains("lesson"), "{refusal:?}");
+    // Moves once, and says how it went.
+    let mut finish = |console: &Console, sec: i32| {
+        let Ok(Command::Propose(proposal)) = commands.try_recv() else {
+            panic!("expected a proposal");
+        };
+        let Ok(Command::Confirm(approval)) = commands.try_recv() else {
+            panic!("expected its approval");
+        };
+        let approved = (approval.proposal_id, approval.decision);
+        assert_eq!(approved, (proposal.id, StepConfirmation::APPROVE));
+        let mut result = StepResult {
+            proposal_id: proposal.id,
+            outcome: StepResult::PLACED,
+            ..StepResult::default()
+        };
+        result.header.stamp.sec = sec;
+        result.duration.sec = 1;
+        let mut after = heightmap();
+        after.header.stamp.sec = sec;
+        after.height_m = vec![sec as f32];
+        console.change(|state, now| {
+            state.on_result(&result, now).unwrap();
+            state.judge_step(ada, true).unwrap_err();
+            state.on_heightmap(after, now).unwrap();
+        });
+        *proposal
+    };
+    let judge = |console: &Console, reached| {
+        console
+            .change(|state, _| state.judge_step(ada, reached))
+            .unwrap();
+    };
+    show(&console).unwrap();
+    finish(&console, 1);
+    show(&console).unwrap_err();
+    judge(&console, true);
+    // Missed: not kept.
+    show(&console).unwrap();
+    finish(&console, 2);
+    judge(&console, false);
+    show(&console).unwrap();
+    finish(&console, 3);
+    judge(&console, true);
+    // Taken back: the arm moves the other way.
+    console
+        .change(|state, now| state.undo_step(ada, now))
+        .unwrap();
+    let back = finish(&console, 4);
+    assert_eq!((back.pick.x, back.place.x), (0.8, 0.2));
+    judge(&console, true);
+    let save = |name: &str| console.change(|state, _| state.lesson_demonstration(ada, name));
+    for name in ["", "../up", "a name", "x/y"] {
+        assert!(save(name).is_err(), "{name:?}");
+    }
+    let demonstration = save("three_blocks").unwrap();
+    assert_eq!(demonstration.problem, "three_blocks");
+    assert_eq!(demonstration.steps.len(), 1);
+    assert_eq!(demonstration.steps[0].delta_reward, 1.0);
+    assert_eq!(demonstration.steps[0].action.place.translation.x, 0.8);
+    assert_eq!(demonstration.last.height_m, [1.0]);
+
+    let folder = tempfile::tempdir().unwrap();
+    let library = crate::library::Library::new(folder.path().join("library"));
+    assert!(library.list().is_empty());
+    library.save("three_blocks", &demonstration).unwrap();
+    let taken = library.save("three_blocks", &demonstration).unwrap_err();
+    assert!(taken.reason.contains("already"), "{taken:?}");
+    let listed = library.list();
+    assert_eq!(listed.len(), 1);
+    assert_eq!(
+        (listed[0].name.as_str(), listed[0].step_count),
+        ("three_blocks", 1)
+    );
+    assert_eq!(library.picture("three_blocks", 1).unwrap().height_m, [1.0]);
+    assert!(library.picture("three_blocks", 2).is_err());
+    assert!(library.picture("../three_blocks", 0).is_err());
+}

@@ -1,0 +1,186 @@
+//! What operators have decided and what the executor has reported.
+
+use std::time::Duration;
+
+use msgs::convert;
+use msgs::sctn_msgs::{ConfirmationRefused, StepConfirmation, StepResult};
+use step_protocol::{ProposalStatus, StepOutcome};
+
+use super::{Decision, InvalidMessage, PastStep, Run, STEPS, Status, duration};
+use crate::refusal::{advice_for, advice_of_oracle};
+
+impl Run {
+    /// An operator has decided, here or elsewhere.
+    pub fn on_confirmation(&mut self, message: &StepConfirmation) {
+        let Some(decision) = Decision::from_msg(message.decision) else {
+            return;
+        };
+        if decision == Decision::Stop {
+            self.stopped = self.goal.as_ref().is_some_and(|goal| !goal.complete);
+            return;
+        }
+        if let (Decision::Advance | Decision::Retry, Some(step)) = (
+            decision,
+            self.steps
+                .iter_mut()
+                .rfind(|step| step.proposal.id == message.proposal_id),
+        ) {
+            step.decision = Some(decision);
+            step.decided_by.clone_from(&message.operator_name);
+        }
+        if let Some(offered) = self.offered(message.proposal_id) {
+            offered.status = match (decision, &offered.status) {
+                (Decision::Approve, Status::Open) => Status::Approved,
+                (Decision::Reject, Status::Open) => Status::Closed,
+                (Decision::Advance | Decision::Retry, Status::Moved { fault }) => {
+                    Status::Confirmed { fault: *fault }
+                }
+                (_, status) => status.clone(),
+            };
+        }
+    }
+
+    /// The executor has reported.
+    pub fn on_result(&mut self, message: &StepResult, now: Duration) -> Result<(), InvalidMessage> {
+        let result = convert::result_from_msg(message).map_err(|error| error.to_string())?;
+        let id = message.proposal_id;
+        match result.outcome {
+            StepOutcome::Refused => {
+                let carried_out = result.was_carried_out();
+                if let Some(offered) = self.offered(id) {
+                    offered.status = match (&offered.status, result.status) {
+                        // The result was lost, for instance while the console was not there.
+                        (Status::Approved, _) if carried_out => Status::Moved { fault: false },
+                        (Status::Open | Status::Approved, Some(status)) => match status {
+                            ProposalStatus::Moving => Status::Approved,
+                            ProposalStatus::Superseded
+                            | ProposalStatus::Rejected
+                            | ProposalStatus::Withdrawn => Status::Closed,
+                            ProposalStatus::Pending | ProposalStatus::Done => Status::Open,
+                        },
+                        (Status::Approved, None) => Status::Open,
+                        (status, _) => (*status).clone(),
+                    };
+                }
+                // A stop that found nothing to stop has stopped the run all the same.
+                if self.stopped && self.offered(id).is_none() {
+                    return Ok(());
+                }
+                let advice = advice_for(result.status, &result.reason);
+                self.note("refusal", sentence(&result.reason), advice, now);
+                return Ok(());
+            }
+            StepOutcome::Rejected => {
+                if let Some(offered) = self.offered(id) {
+                    offered.status = Status::Closed;
+                }
+                return Ok(());
+            }
+            StepOutcome::Stopped => {
+                self.stopped = true;
+                self.note(
+                    "note",
+                    "The run was stopped.",
+                    "Look at the cell. When it is safe, bring the arm home, then continue with the present step.",
+                    now,
+                );
+            }
+            StepOutcome::Fault => self.note(
+                "fault",
+                format!(
+                    "The robot broke the motion off: {}",
+                    sentence(&result.reason)
+                ),
+                "Look at the cell. When it is safe, bring the arm home, then try the step again.",
+                now,
+            ),
+            StepOutcome::Placed
+            | StepOutcome::NoContact
+            | StepOutcome::GraspFailed
+            | StepOutcome::Dropped
+            | StepOutcome::LagAborted => {}
+        }
+        let Some(offered) = self.offered(message.proposal_id) else {
+            return Ok(());
+        };
+        if !result.arm_moved() {
+            offered.status = Status::Closed;
+            return Ok(());
+        }
+        offered.status = Status::Moved {
+            fault: result.outcome == StepOutcome::Fault,
+        };
+        let proposal = offered.message.clone();
+        let before = duration(&proposal.header.stamp)?;
+        let before = self
+            .views
+            .iter()
+            .rfind(|view| view.stamp == before)
+            .cloned();
+        self.step_count += 1;
+        if self.steps.len() == STEPS {
+            self.steps.pop_front();
+        }
+        let ended = result.stamp;
+        self.steps.push_back(PastStep {
+            number: self.step_count,
+            proposal,
+            outcome: result.outcome,
+            reason: result.reason,
+            duration: result.duration,
+            ended,
+            decision: None,
+            decided_by: String::new(),
+            before,
+            after: self.views.iter().find(|view| view.stamp >= ended).cloned(),
+        });
+        Ok(())
+    }
+
+    /// The oracle has refused a decision on a step that was carried out: it has changed nothing.
+    pub fn on_confirmation_refused(&mut self, message: &ConfirmationRefused, now: Duration) {
+        match message.reason {
+            // The question is still open.
+            ConfirmationRefused::UNKNOWN => {
+                if let Some(offered) = self.offered(message.proposal_id)
+                    && let Status::Confirmed { fault } = offered.status
+                {
+                    offered.status = Status::Moved { fault };
+                }
+            }
+            ConfirmationRefused::STOPPED => {
+                self.stopped = self.goal.as_ref().is_some_and(|goal| !goal.complete);
+            }
+            _ => {}
+        }
+        let advice = advice_of_oracle(message.reason);
+        self.note("refusal", sentence(&message.message), advice, now);
+    }
+}
+
+pub(crate) fn outcome_words(outcome: StepOutcome) -> &'static str {
+    match outcome {
+        StepOutcome::Placed => "placed",
+        StepOutcome::NoContact => "found nothing to pick",
+        StepOutcome::GraspFailed => "suction held nothing",
+        StepOutcome::Dropped => "lost the object on the way",
+        StepOutcome::LagAborted => "stopped: the arm lagged behind",
+        StepOutcome::Fault => "broke off by a fault",
+        StepOutcome::Stopped => "stopped by the operator",
+        StepOutcome::Refused => "refused",
+        StepOutcome::Rejected => "rejected",
+    }
+}
+
+/// First letter large, full stop at the end.
+pub(super) fn sentence(text: &str) -> String {
+    let text = text.trim();
+    let mut characters = text.chars();
+    let mut sentence: String = characters.next().map_or(String::new(), |first| {
+        first.to_uppercase().chain(characters).collect()
+    });
+    if !sentence.ends_with(['.', '!', '?']) {
+        sentence.push('.');
+    }
+    sentence
+}

@@ -61,6 +61,7 @@ def samples(demonstration):
 
 def train(net, data, steps, generator):
     optimiser = torch.optim.Adam(net.parameters(), 1e-3)
+    losses = []
     for step in range(steps):
         seen, goal, pick, place = data[generator.integers(len(data))]
         picks, places, _ = net(image(seen | {"goal": goal}), pick)
@@ -69,8 +70,9 @@ def train(net, data, steps, generator):
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()
+        losses.append(loss.item())
         if (step + 1) % 100 == 0:
-            print(f"step {step + 1}: loss {loss.item():.2f}", flush=True)
+            print(f"step {step + 1}: mean loss {np.mean(losses[-100:]):.2f}", flush=True)
 
 
 @torch.no_grad()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.metadata
 import json
+import math
 import pathlib
 import subprocess
 import sys
@@ -54,7 +55,9 @@ def test_the_transporter_example_learns_and_acts(torch):
     out = run("examples/transporter.py", "--demonstrations", "4", "--steps", "200", "--episodes", "1")
     losses = [float(line.split()[-1]) for line in out.splitlines() if line.startswith("step")]
     assert len(losses) == 2
-    assert losses[-1] < 10.0
+    # Where nothing is learned: the logarithms of 160 x 80 picks and of 8 times as many places.
+    nothing = 2 * math.log(160 * 80) + math.log(8)
+    assert losses[1] < 0.7 * losses[0] < 0.7 * nothing
     assert "completed" in out
 
 

@@ -48,7 +48,7 @@ impl DriverError {
 }
 
 /// The way to the driver.
-pub(crate) struct Link {
+pub(crate) struct DriverClient {
     follow: Arc<ActionClient<FollowJointTrajectory>>,
     until: Arc<ActionClient<FollowJointTrajectoryUntil>>,
     set_io: ServiceClient<SetIO>,
@@ -64,7 +64,7 @@ pub(crate) struct Link {
     tasks: TaskGroup,
 }
 
-impl Link {
+impl DriverClient {
     pub(crate) fn new(
         node: &Node,
         parameters: &Driver,

@@ -4,11 +4,11 @@
 //! topics, service and actions, and reports.
 
 mod driver;
+mod dry_run;
 mod home;
 mod node;
 mod parameters;
 mod presence;
-mod rehearsal;
 pub mod status;
 mod stop_memory;
 mod surface;

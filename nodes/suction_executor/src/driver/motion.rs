@@ -13,7 +13,7 @@ use tokio::time::{MissedTickBehavior, interval, sleep, timeout};
 use tokio_util::sync::CancellationToken;
 use tracing::{debug, info, warn};
 
-use super::{DriverError, Link};
+use super::{DriverClient, DriverError};
 use crate::parameters::{ContactSign, Driver};
 
 /// How often a motion is looked after.
@@ -23,7 +23,7 @@ const CANCEL_PERIOD: Duration = Duration::from_millis(200);
 /// After the time that an action may take to answer, an answer that is still to come is waited for by so much more.
 const LATE_ANSWER: Duration = Duration::from_secs(30);
 
-impl Link {
+impl DriverClient {
     /// Has a goal carried out, under watch.
     ///
     /// # Errors

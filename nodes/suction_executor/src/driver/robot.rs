@@ -16,13 +16,13 @@ use tracing::debug;
 use ur5::{JointTrajectory, Joints};
 
 use super::readiness::Readiness;
-use super::{DriverError, Link};
+use super::{DriverClient, DriverError};
 use crate::parameters::ContactSign;
 use crate::status::DriverStatus;
 
 /// The robot for one primitive. Its methods block: not for the runtime's own threads.
 pub(crate) struct DriverRobot {
-    link: Arc<Link>,
+    client: Arc<DriverClient>,
     runtime: Handle,
     stop: CancellationToken,
     /// When the primitive began, as the times of arrival in the status.
@@ -34,10 +34,10 @@ pub(crate) struct DriverRobot {
 }
 
 impl DriverRobot {
-    pub(crate) fn new(link: Arc<Link>, runtime: Handle, stop: CancellationToken) -> Self {
+    pub(crate) fn new(client: Arc<DriverClient>, runtime: Handle, stop: CancellationToken) -> Self {
         Self {
-            begun: link.origin.elapsed(),
-            link,
+            begun: client.origin.elapsed(),
+            client,
             runtime,
             stop,
             left: None,
@@ -50,14 +50,14 @@ impl DriverRobot {
         if self.stop.is_cancelled() {
             return Err(DriverError::Stopped);
         }
-        if let Some(obstacle) = self.link.obstacle() {
+        if let Some(obstacle) = self.client.obstacle() {
             return Err(DriverError::Fault(obstacle));
         }
-        let interrupted_at = self.link.status.borrow().interrupted_at;
+        let interrupted_at = self.client.status.borrow().interrupted_at;
         if interrupted_at.is_some_and(|at| at > self.begun) {
             return Err(DriverError::Fault(format!(
                 "joint_states were interrupted for more than {:.1} s since the motion began: this process or the driver stood still",
-                self.link.parameters.status_max_age_s
+                self.client.parameters.status_max_age_s
             )));
         }
         Ok(())
@@ -67,10 +67,10 @@ impl DriverRobot {
     /// checks may still be under way.
     async fn ready(&self) -> Result<(), DriverError> {
         self.check()?;
-        let mut readiness = self.link.readiness.clone();
-        let limit = Duration::from_secs_f64(self.link.parameters.reading_timeout_s);
+        let mut readiness = self.client.readiness.clone();
+        let limit = Duration::from_secs_f64(self.client.parameters.reading_timeout_s);
         let checked = async {
-            self.link.heartbeat.idle().await;
+            self.client.heartbeat.idle().await;
             // An error: what was found last counts.
             let unchecked = |found: &Readiness| matches!(found, Readiness::Unchecked(_));
             let _ = readiness.wait_for(|found| !unchecked(found)).await;
@@ -79,7 +79,7 @@ impl DriverRobot {
             checked = timeout(limit, checked) => checked,
             () = self.stop.cancelled() => return Err(DriverError::Stopped),
         };
-        if let Some(reason) = self.link.readiness.borrow().obstacle() {
+        if let Some(reason) = self.client.readiness.borrow().obstacle() {
             return Err(DriverError::Fault(reason));
         }
         checked.map_err(|_| {
@@ -93,8 +93,8 @@ impl DriverRobot {
         what: &str,
         mut look: impl FnMut(&DriverStatus) -> Option<T>,
     ) -> Result<T, DriverError> {
-        let mut status = self.link.status.clone();
-        let limit = Duration::from_secs_f64(self.link.parameters.reading_timeout_s);
+        let mut status = self.client.status.clone();
+        let limit = Duration::from_secs_f64(self.client.parameters.reading_timeout_s);
         let waiting = async {
             loop {
                 if let Some(found) = look(&status.borrow_and_update()) {
@@ -115,20 +115,20 @@ impl DriverRobot {
     }
 
     async fn read_joints(&mut self) -> Result<Joints, DriverError> {
-        let called = self.link.origin.elapsed();
+        let called = self.client.origin.elapsed();
         let left = self.left.take();
-        let link = Arc::clone(&self.link);
+        let client = Arc::clone(&self.client);
         let reading = self
             .wait_for("the joints have not come to rest", |status| {
                 let joints = status.joints?;
                 let after_motion = left.is_none_or(|left| joints.value.stamp > left);
-                let at_rest = link.rests_since(status, called);
+                let at_rest = client.rests_since(status, called);
                 (after_motion && at_rest).then_some(joints.value)
             })
             .await?;
         debug!(
             "at rest after {:?}",
-            self.link.origin.elapsed().saturating_sub(called)
+            self.client.origin.elapsed().saturating_sub(called)
         );
         let first = self.stamps.map_or(reading.stamp, |(first, _)| first);
         self.stamps = Some((first, reading.stamp));
@@ -142,9 +142,9 @@ impl DriverRobot {
             pin: pin as i8,
             state: f32::from(u8::from(on)),
         };
-        let options = self.link.options();
+        let options = self.client.options();
         let response = tokio::select! {
-            response = self.link.set_io.call(&request, &options) => response,
+            response = self.client.set_io.call(&request, &options) => response,
             () = self.stop.cancelled() => return Err(DriverError::Stopped),
         };
         if !response.map_err(DriverError::fault)?.success {
@@ -158,8 +158,8 @@ impl DriverRobot {
 
     async fn switch_suction(&self, on: bool) -> Result<(), DriverError> {
         self.ready().await?;
-        let parameters = &self.link.parameters;
-        let called = self.link.origin.elapsed();
+        let parameters = &self.client.parameters;
+        let called = self.client.origin.elapsed();
         self.switch_pin(parameters.suction_pin, on).await?;
         self.wait_for("io_states have not confirmed the suction pin", |status| {
             let pins = status.pins?;
@@ -190,7 +190,7 @@ impl DriverRobot {
 
     /// Whether the vacuum sensor says so within a time (s), read after now.
     async fn vacuum_within(&self, limit_s: f64, held: bool) -> Result<bool, DriverError> {
-        let mut status = self.link.status.clone();
+        let mut status = self.client.status.clone();
         let seen = status.borrow().pins.map_or(0, |pins| pins.count);
         let waiting = async {
             loop {
@@ -211,7 +211,12 @@ impl DriverRobot {
     /// What was sent before the call may still arrive after it; what comes second was sent later.
     async fn read_vacuum(&self) -> Result<bool, DriverError> {
         self.check()?;
-        let seen = self.link.status.borrow().pins.map_or(0, |pins| pins.count);
+        let seen = self
+            .client
+            .status
+            .borrow()
+            .pins
+            .map_or(0, |pins| pins.count);
         self.wait_for("no io_states have arrived", |status| {
             let pins = status.pins?;
             (pins.count >= seen + 2).then_some(pins.value.vacuum)
@@ -237,7 +242,7 @@ impl DriverRobot {
         {
             return Ok(true);
         }
-        if violated && self.link.parameters.lag_rule {
+        if violated && self.client.parameters.lag_rule {
             return Ok(false);
         }
         let what = if violated {
@@ -251,25 +256,25 @@ impl DriverRobot {
             reason
         };
         // Why the robot has stopped is the better reason.
-        let fault = DriverError::Fault(match self.link.obstacle() {
+        let fault = DriverError::Fault(match self.client.obstacle() {
             Some(obstacle) => format!("{obstacle}; {name} ended as {status:?}: {reason}"),
             None => format!("{name} ended as {status:?} with error code {code}{what}: {reason}"),
         });
-        Err(self.link.break_off(fault).await)
+        Err(self.client.break_off(fault).await)
     }
 
     async fn move_along(&self, trajectory: &JointTrajectory) -> Result<bool, DriverError> {
         self.ready().await?;
-        let (link, parameters) = (&self.link, &self.link.parameters);
+        let (client, parameters) = (&self.client, &self.client.parameters);
         let goal = FollowJointTrajectoryGoal {
-            trajectory: link.trajectory(trajectory)?,
-            path_tolerance: link.tolerances(parameters.path_tolerance_rad),
-            goal_tolerance: link.tolerances(parameters.goal_tolerance_rad),
+            trajectory: client.trajectory(trajectory)?,
+            path_tolerance: client.tolerances(parameters.path_tolerance_rad),
+            goal_tolerance: client.tolerances(parameters.goal_tolerance_rad),
             ..Default::default()
         };
-        let motion = link.carry_out(&link.follow, goal, trajectory.duration(), &self.stop);
+        let motion = client.carry_out(&client.follow, goal, trajectory.duration(), &self.stop);
         let (status, result) = motion.await?;
-        let name = link.follow.name();
+        let name = client.follow.name();
         self.reached(name, status, result.error_code, &result.error_string)
             .await
     }
@@ -277,17 +282,17 @@ impl DriverRobot {
     /// The driver's own way: an action that stops the arm at contact.
     async fn move_until_contact(&self, trajectory: &JointTrajectory) -> Result<bool, DriverError> {
         self.ready().await?;
-        let (link, parameters) = (&self.link, &self.link.parameters);
+        let (client, parameters) = (&self.client, &self.client.parameters);
         let goal = FollowJointTrajectoryUntilGoal {
-            trajectory: link.trajectory(trajectory)?,
-            path_tolerance: link.tolerances(parameters.path_tolerance_rad),
-            goal_tolerance: link.tolerances(parameters.goal_tolerance_rad),
+            trajectory: client.trajectory(trajectory)?,
+            path_tolerance: client.tolerances(parameters.path_tolerance_rad),
+            goal_tolerance: client.tolerances(parameters.goal_tolerance_rad),
             until_type: FollowJointTrajectoryUntilGoal::TOOL_CONTACT,
             ..Default::default()
         };
-        let motion = link.carry_out(&link.until, goal, trajectory.duration(), &self.stop);
+        let motion = client.carry_out(&client.until, goal, trajectory.duration(), &self.stop);
         let (status, result) = motion.await?;
-        let name = link.until.name();
+        let name = client.until.name();
         let reached = self
             .reached(name, status, result.error_code, &result.error_string)
             .await?;
@@ -299,7 +304,7 @@ impl DriverRobot {
     /// Suction is on while the tip comes down, and vacuum is the sign of contact. Where something is held already, there is no sign:
     /// the end of the way is where it is put down.
     async fn move_until_vacuum(&self, trajectory: &JointTrajectory) -> Result<bool, DriverError> {
-        let parameters = &self.link.parameters;
+        let parameters = &self.client.parameters;
         if self.read_vacuum().await? {
             return self.move_along(trajectory).await.map(|_| false);
         }
@@ -307,7 +312,7 @@ impl DriverRobot {
         self.switch_pin(parameters.suction_pin, true).await?;
         let motion = self.move_along(trajectory);
         tokio::pin!(motion);
-        let mut status = self.link.status.clone();
+        let mut status = self.client.status.clone();
         let held = async {
             while !status
                 .borrow_and_update()
@@ -326,7 +331,7 @@ impl DriverRobot {
                 self.vacuum_within(parameters.grasp_wait_s, true).await?
             }
             () = held => {
-                self.link.stop_arm().await.map_err(DriverError::Fault)?;
+                self.client.stop_arm().await.map_err(DriverError::Fault)?;
                 self.check()?;
                 true
             }
@@ -359,7 +364,7 @@ impl Robot for DriverRobot {
     fn follow_until_contact(&mut self, trajectory: &JointTrajectory) -> Result<bool, DriverError> {
         self.leave();
         let runtime = self.runtime.clone();
-        match self.link.parameters.contact {
+        match self.client.parameters.contact {
             ContactSign::UntilAction => runtime.block_on(self.move_until_contact(trajectory)),
             ContactSign::Vacuum => runtime.block_on(self.move_until_vacuum(trajectory)),
             // Where the surface is known, the end of the way is the contact.

@@ -22,7 +22,7 @@ struct Bench {
     sim: Context,
     own: Context,
     node: Node,
-    link: Arc<Link>,
+    client: Arc<DriverClient>,
     cell: WorkCell,
 }
 
@@ -39,7 +39,7 @@ impl Bench {
             .node::<NoParameters>("bench", &RosArguments::default())
             .unwrap();
         let cell = WorkCell::builtin().unwrap();
-        let link = Link::new(&node, &driver, &cell).unwrap();
+        let client = DriverClient::new(&node, &driver, &cell).unwrap();
         let problems = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../config/problems");
         let mut line = vec!["--ros-args".to_owned()];
         let mut set = |name: &str, value: &str| {
@@ -58,11 +58,11 @@ impl Bench {
             sim,
             own,
             node,
-            link: Arc::new(link),
+            client: Arc::new(client),
             cell,
         };
         bench
-            .until("a ready driver", |bench| bench.link.obstacle().is_none())
+            .until("a ready driver", |bench| bench.client.obstacle().is_none())
             .await;
         bench
     }
@@ -70,7 +70,7 @@ impl Bench {
     async fn until(&self, what: &str, condition: impl Fn(&Self) -> bool) {
         let end = Instant::now() + PATIENCE;
         while !condition(self) {
-            let obstacle = self.link.obstacle();
+            let obstacle = self.client.obstacle();
             assert!(Instant::now() < end, "no {what}: {obstacle:?}");
             tokio::time::sleep(Duration::from_millis(10)).await;
         }
@@ -82,7 +82,7 @@ impl Bench {
         stop: &CancellationToken,
         work: impl FnOnce(&mut DriverRobot) -> T + Send + 'static,
     ) -> tokio::task::JoinHandle<T> {
-        let mut robot = DriverRobot::new(Arc::clone(&self.link), Handle::current(), stop.clone());
+        let mut robot = DriverRobot::new(Arc::clone(&self.client), Handle::current(), stop.clone());
         tokio::task::spawn_blocking(move || work(&mut robot))
     }
 
@@ -110,7 +110,7 @@ impl Bench {
     }
 
     fn joints(&self) -> Joints {
-        self.link
+        self.client
             .status
             .borrow()
             .joints
@@ -181,7 +181,7 @@ async fn a_descent_that_is_accepted_late_is_carried_out_once() {
     });
     assert_eq!(descended.await.unwrap(), Ok(true));
     // Alive: a goal id that comes twice ends the driver.
-    assert!(bench.link.obstacle().is_none());
+    assert!(bench.client.obstacle().is_none());
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -214,9 +214,9 @@ async fn a_rejected_goal_cancels_everything_and_the_arm_comes_to_rest() {
     };
     let bench = Bench::start(&hardware, driver).await;
     let descent = bench.over_the_table().await;
-    let other = bench.link.follow.clone();
+    let other = bench.client.follow.clone();
     let goal = FollowJointTrajectoryGoal {
-        trajectory: bench.link.trajectory(&bench.turn(2.0)).unwrap(),
+        trajectory: bench.client.trajectory(&bench.turn(2.0)).unwrap(),
         ..Default::default()
     };
     let sent = other
@@ -310,7 +310,7 @@ async fn a_motion_that_is_stopped_because_the_node_ends_is_watched_until_the_arm
     assert_eq!(moved.await.unwrap(), Err(DriverError::Stopped));
     let travel_rad = bench.travel_rad(0.5).await;
     assert!(travel_rad < 1e-3, "{travel_rad}");
-    bench.link.heartbeat.quiet().await;
+    bench.client.heartbeat.quiet().await;
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -360,7 +360,7 @@ async fn every_fault_of_the_robot_ends_a_motion_with_its_name() {
         assert!(refused.contains(name), "{fault}: {refused}");
         bench.set_fault("none").await;
         bench
-            .until("released robot", |bench| bench.link.obstacle().is_none())
+            .until("released robot", |bench| bench.client.obstacle().is_none())
             .await;
     }
 }
@@ -394,7 +394,7 @@ async fn what_the_driver_lacks_is_refused_by_name() {
         ),
     ] {
         let bench = Bench::start(&[hardware], driver).await;
-        let checked = |bench: &Bench| match &*bench.link.readiness.borrow() {
+        let checked = |bench: &Bench| match &*bench.client.readiness.borrow() {
             Readiness::Unchecked(_) => None,
             Readiness::Ready => Some(String::new()),
             Readiness::Refused(reason) => Some(reason.clone()),

@@ -1,4 +1,4 @@
-//! A primitive carried out in thought, to know beforehand whether all of it can be planned.
+//! A dry run of a proposal: its motion is planned to the end and nothing moves.
 
 use std::convert::Infallible;
 use std::sync::Arc;
@@ -17,7 +17,7 @@ use crate::status::DriverStatus;
 use crate::surface::touchdown;
 
 /// A robot that is always where it was sent, and whose tool finds the table.
-struct Rehearsal {
+struct DryRun {
     joints: Joints,
     holds: bool,
     motion: PlannedPrimitive,
@@ -84,7 +84,7 @@ pub(crate) fn planned_motion(
     })
 }
 
-impl Robot for Rehearsal {
+impl Robot for DryRun {
     type Error = Infallible;
 
     fn joints(&mut self) -> Result<Joints, Infallible> {
@@ -161,17 +161,17 @@ impl RobotState for RobotNow {
                 self.observation_max_age.as_secs_f64()
             ));
         }
-        self.rehearse(proposal).map(|_| ())
+        self.dry_run(proposal).map(|_| ())
     }
 }
 
 impl RobotNow {
     /// The motion of a proposal from where the robot is; else why it cannot be planned.
-    pub fn rehearse(&self, proposal: &Proposal) -> Result<PlannedPrimitive, String> {
+    pub fn dry_run(&self, proposal: &Proposal) -> Result<PlannedPrimitive, String> {
         let (Some(joints), Some(pins)) = (&self.status.joints, &self.status.pins) else {
             return Err("the robot's state is not known".into());
         };
-        let mut robot = Rehearsal {
+        let mut robot = DryRun {
             joints: joints.value.positions_rad,
             holds: pins.value.vacuum,
             motion: PlannedPrimitive::default(),
@@ -258,7 +258,7 @@ mod tests {
         };
         assert_eq!(robot.obstacle(), None);
         robot.plan(&proposal(0.5)).unwrap();
-        let motion = robot.rehearse(&proposal(0.5)).unwrap();
+        let motion = robot.dry_run(&proposal(0.5)).unwrap();
         let names: [String; 6] = std::array::from_fn(|joint| format!("joint {joint}"));
         let message = planned_motion(Ok(motion), 7, &names, Header::default()).unwrap();
         assert_eq!((message.proposal_id, message.reason.as_str()), (7, ""));
@@ -283,7 +283,7 @@ mod tests {
             let steps = pair[0].positions.iter().zip(&pair[1].positions);
             assert!(steps.into_iter().all(|(a, b)| (a - b).abs() < 0.2));
         }
-        let refused = robot.rehearse(&proposal(2.0));
+        let refused = robot.dry_run(&proposal(2.0));
         let message = planned_motion(refused, 8, &names, Header::default()).unwrap();
         assert!(message.trajectory.points.is_empty() && message.reason.contains("pick"));
         let reason = robot.plan(&proposal(2.0)).unwrap_err();

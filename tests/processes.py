@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import pathlib
 import signal
 import socket
 import subprocess
+import tempfile
 import time
+from typing import IO
 
 REPOSITORY = pathlib.Path(__file__).resolve().parent.parent
 BINARIES = REPOSITORY / os.environ.get("CARGO_TARGET_DIR", "target") / "release"
@@ -17,7 +20,7 @@ GRACE_S = 10.0
 
 
 def free_domain() -> int:
-    """A ROS domain id whose discovery ports nobody on this machine has.
+    """A ROS domain id whose discovery ports nobody on this machine has, and which no other run of the tests was given.
 
     Ids above 100 would use ports that the kernel hands out to others.
     """
@@ -26,12 +29,28 @@ def free_domain() -> int:
     for offset in range(100):
         domain = 1 + (start + offset) % 100
         ports = [7400 + 250 * domain + port for port in (0, 1, *range(10, 34))]
-        if all(_is_free(port) for port in ports):
+        if all(_is_free(port) for port in ports) and _claim(domain):
             return domain
     raise RuntimeError("no free ROS domain id between 1 and 100")
 
 
 free_domain.calls = 0
+# The lock of each domain id that was given out, held until this process ends.
+_claims: dict[int, IO[bytes]] = {}
+
+
+def _claim(domain: int) -> bool:
+    """Takes the lock of a domain id, which one process of this machine holds at a time."""
+    if domain in _claims:
+        return True
+    lock = (pathlib.Path(tempfile.gettempdir()) / f"sctn_ros_domain_{os.getuid()}_{domain}.lock").open("ab")
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        lock.close()
+        return False
+    _claims[domain] = lock
+    return True
 
 
 def _is_free(port: int) -> bool:

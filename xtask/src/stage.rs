@@ -93,7 +93,8 @@ impl Stage {
                 build_programs()?;
                 run(environment
                     .python()?
-                    .args(["-m", "pytest", "tests"])
+                    // Two files at a time: most tests wait for discovery, or for time to pass.
+                    .args(["-m", "pytest", "-n", "2", "--dist", "loadfile", "tests"])
                     .args(pytest_arguments))
             }
             Self::Kilted => {

@@ -6,9 +6,10 @@
 
 mod driver;
 pub mod frames;
+mod hardware;
 mod node;
 mod parameters;
-mod workcell;
+mod simulated_cell;
 
 pub use node::{HardwareNode, configure};
 pub use parameters::SimWorkcellParameters;

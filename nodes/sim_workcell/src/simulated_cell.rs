@@ -28,7 +28,7 @@ pub(crate) struct Wiring {
 const PAUSE: Duration = Duration::from_secs(1);
 
 /// An episode of a problem, driven by goals and pins.
-pub(crate) struct Workcell {
+pub(crate) struct SimulatedCell {
     environment: Environment,
     /// Simulated time of the episodes before: time never runs back.
     past: Duration,
@@ -73,7 +73,7 @@ pub(crate) enum Step {
     Failed(String),
 }
 
-impl Workcell {
+impl SimulatedCell {
     /// An episode with everything at rest.
     pub(crate) fn new(
         problem: &Problem,
@@ -442,10 +442,10 @@ mod tests {
         Problem::parse("placing", text).unwrap()
     }
 
-    fn workcell() -> (Workcell, WorkCell) {
+    fn cell() -> (SimulatedCell, WorkCell) {
         let work_cell = WorkCell::builtin().unwrap();
         (
-            Workcell::new(
+            SimulatedCell::new(
                 &problem(),
                 &work_cell,
                 10_000,
@@ -472,8 +472,8 @@ mod tests {
         }
     }
 
-    fn output(workcell: &Workcell, pin: u8) -> bool {
-        let states = workcell.io_states().digital_out_states;
+    fn output(cell: &SimulatedCell, pin: u8) -> bool {
+        let states = cell.io_states().digital_out_states;
         states
             .iter()
             .find(|digital| digital.pin == pin)
@@ -483,20 +483,19 @@ mod tests {
 
     #[test]
     fn pins_are_set_and_shown_and_suction_is_one_of_them() {
-        let (mut workcell, _) = workcell();
-        assert!(!output(&workcell, 16) && !output(&workcell, 3));
-        workcell.set_io(&set(16, 1.0)).unwrap();
-        workcell.set_io(&set(3, 1.0)).unwrap();
-        assert!(output(&workcell, 16) && output(&workcell, 3));
-        assert!(workcell.environment().cell().suction());
+        let (mut cell, _) = cell();
+        assert!(!output(&cell, 16) && !output(&cell, 3));
+        cell.set_io(&set(16, 1.0)).unwrap();
+        cell.set_io(&set(3, 1.0)).unwrap();
+        assert!(output(&cell, 16) && output(&cell, 3));
+        assert!(cell.environment().cell().suction());
         // Again, because the reply was lost.
-        workcell.set_io(&set(16, 1.0)).unwrap();
-        workcell.set_io(&set(16, 0.0)).unwrap();
-        assert!(!output(&workcell, 16) && output(&workcell, 3));
+        cell.set_io(&set(16, 1.0)).unwrap();
+        cell.set_io(&set(16, 0.0)).unwrap();
+        assert!(!output(&cell, 16) && output(&cell, 3));
         // In the air nothing is held.
         assert!(
-            workcell
-                .io_states()
+            cell.io_states()
                 .digital_in_states
                 .iter()
                 .all(|digital| !digital.state)
@@ -505,8 +504,8 @@ mod tests {
 
     #[test]
     fn requests_without_sense_change_nothing() {
-        let (mut workcell, _) = workcell();
-        let before = workcell.io_states();
+        let (mut cell, _) = cell();
+        let before = cell.io_states();
         for (request, expected) in [
             (set(-1, 1.0), "pin is -1"),
             (set(18, 1.0), "pin is 18"),
@@ -527,80 +526,80 @@ mod tests {
                 "fun is 3",
             ),
         ] {
-            let reason = workcell.set_io(&request).unwrap_err();
+            let reason = cell.set_io(&request).unwrap_err();
             assert!(reason.contains(expected), "{reason}");
         }
-        assert_eq!(workcell.io_states(), before);
+        assert_eq!(cell.io_states(), before);
     }
 
     #[test]
     fn a_goal_moves_the_arm_in_simulated_time_only() {
-        let (mut workcell, work_cell) = workcell();
-        assert!(workcell.is_at_rest());
-        assert_eq!(workcell.assess(), None);
-        let start = workcell.time();
+        let (mut cell, work_cell) = cell();
+        assert!(cell.is_at_rest());
+        assert_eq!(cell.assess(), None);
+        let start = cell.time();
         let trajectory =
             follow_trajectory(&turn(&work_cell), &work_cell.arm, &work_cell.joint_names).unwrap();
-        workcell.begin(trajectory.clone(), false, &any()).unwrap();
-        assert_eq!(workcell.step(NOW), Step::Moving);
-        assert!(workcell.begin(trajectory.clone(), false, &any()).is_err());
-        while workcell.step(NOW) == Step::Moving {}
-        assert!(workcell.time() - start >= Duration::from_secs(1));
-        assert!((workcell.joints_rad() - trajectory.last().positions_rad).amax() < 1e-12);
-        assert_eq!(workcell.velocities_rad_s(), Joints::zeros());
-        assert!(!workcell.is_at_rest());
-        assert_eq!(workcell.assess(), None);
+        cell.begin(trajectory.clone(), false, &any()).unwrap();
+        assert_eq!(cell.step(NOW), Step::Moving);
+        assert!(cell.begin(trajectory.clone(), false, &any()).is_err());
+        while cell.step(NOW) == Step::Moving {}
+        assert!(cell.time() - start >= Duration::from_secs(1));
+        assert!((cell.joints_rad() - trajectory.last().positions_rad).amax() < 1e-12);
+        assert_eq!(cell.velocities_rad_s(), Joints::zeros());
+        assert!(!cell.is_at_rest());
+        assert_eq!(cell.assess(), None);
         // From here the same trajectory would jump.
-        let failure = workcell.begin(trajectory, false, &any()).unwrap_err();
+        let failure = cell.begin(trajectory, false, &any()).unwrap_err();
         assert!(failure.reason.contains("starts at"), "{failure}");
     }
 
     #[test]
     fn a_reset_begins_the_episode_of_a_seed_as_a_start_does_and_time_goes_on() {
-        let (mut workcell, work_cell) = workcell();
-        let start = (workcell.time(), workcell.environment().state_hash());
+        let (mut cell, work_cell) = cell();
+        let start = (cell.time(), cell.environment().state_hash());
         let trajectory =
             follow_trajectory(&turn(&work_cell), &work_cell.arm, &work_cell.joint_names).unwrap();
-        workcell.begin(trajectory, false, &any()).unwrap();
-        while workcell.step(NOW) == Step::Moving {}
-        workcell.set_io(&set(16, 1.0)).unwrap();
-        let before = workcell.time();
-        workcell.reset(&problem(), &work_cell, 10_002).unwrap();
-        assert_ne!(workcell.environment().state_hash(), start.1);
-        workcell.reset(&problem(), &work_cell, 10_000).unwrap();
-        assert_eq!(workcell.environment().state_hash(), start.1);
-        assert!(workcell.time() > before + PAUSE && workcell.is_at_rest());
-        assert_eq!(workcell.joints_rad(), work_cell.arm.home);
-        assert!(!output(&workcell, 16) && workcell.assess().is_none());
+        cell.begin(trajectory, false, &any()).unwrap();
+        while cell.step(NOW) == Step::Moving {}
+        cell.set_io(&set(16, 1.0)).unwrap();
+        let before = cell.time();
+        cell.reset(&problem(), &work_cell, 10_002).unwrap();
+        assert_ne!(cell.environment().state_hash(), start.1);
+        cell.reset(&problem(), &work_cell, 10_000).unwrap();
+        assert_eq!(cell.environment().state_hash(), start.1);
+        assert!(cell.time() > before + PAUSE && cell.is_at_rest());
+        assert_eq!(cell.joints_rad(), work_cell.arm.home);
+        assert!(!output(&cell, 16) && cell.assess().is_none());
     }
 
     #[test]
     fn a_cancelled_arm_stands_still() {
-        let (mut workcell, work_cell) = workcell();
+        let (mut cell, work_cell) = cell();
         let trajectory =
             follow_trajectory(&turn(&work_cell), &work_cell.arm, &work_cell.joint_names).unwrap();
-        workcell.begin(trajectory, false, &any()).unwrap();
+        cell.begin(trajectory, false, &any()).unwrap();
         for _ in 0..200 {
-            assert_eq!(workcell.step(NOW), Step::Moving);
+            assert_eq!(cell.step(NOW), Step::Moving);
         }
-        assert!(workcell.velocities_rad_s().amax() > 0.0);
-        workcell.cancel();
-        let (time, joints) = (workcell.time(), workcell.joints_rad());
-        assert!(matches!(workcell.step(NOW), Step::Failed(_)));
-        assert_eq!((workcell.time(), workcell.joints_rad()), (time, joints));
-        assert_eq!(workcell.velocities_rad_s(), Joints::zeros());
+        assert!(cell.velocities_rad_s().amax() > 0.0);
+        cell.cancel();
+        let (time, joints) = (cell.time(), cell.joints_rad());
+        assert!(matches!(cell.step(NOW), Step::Failed(_)));
+        assert_eq!((cell.time(), cell.joints_rad()), (time, joints));
+        assert_eq!(cell.velocities_rad_s(), Joints::zeros());
     }
 
-    fn behaving(hardware: HardwareSettings) -> (Workcell, WorkCell) {
-        let (_, work_cell) = workcell();
+    fn behaving(hardware: HardwareSettings) -> (SimulatedCell, WorkCell) {
+        let (_, work_cell) = cell();
         let problem = problem();
-        let workcell = Workcell::new(&problem, &work_cell, 10_000, WIRING, None, hardware);
-        (workcell.unwrap(), work_cell)
+        let cell = SimulatedCell::new(&problem, &work_cell, 10_000, WIRING, None, hardware);
+        (cell.unwrap(), work_cell)
     }
 
     #[test]
     fn an_arm_that_lags_behind_leaves_a_tight_tolerance_and_keeps_a_loose_one() {
-        let (mut workcell, work_cell) = behaving(HardwareSettings {
+        let (mut cell, work_cell) = behaving(HardwareSettings {
             servo_delay_s: 0.05,
             braking_time_s: 0.1,
             ..HardwareSettings::default()
@@ -608,10 +607,10 @@ mod tests {
         let trajectory =
             follow_trajectory(&turn(&work_cell), &work_cell.arm, &work_cell.joint_names).unwrap();
         let end = trajectory.last().positions_rad;
-        let begin = workcell.begin(trajectory.clone(), false, &Joints::repeat(0.002));
+        let begin = cell.begin(trajectory.clone(), false, &Joints::repeat(0.002));
         begin.unwrap();
         let deviation = loop {
-            match workcell.step(NOW) {
+            match cell.step(NOW) {
                 Step::Moving => {}
                 Step::Deviated(deviation) => break deviation,
                 other => panic!("{other:?}"),
@@ -619,42 +618,40 @@ mod tests {
         };
         assert_eq!(deviation.joint, 0);
         // The arm brakes on its way, and stands.
-        let at_deviation = workcell.joints_rad()[0];
-        workcell.cancel();
-        assert!(workcell.is_moving());
-        while workcell.is_moving() {
-            workcell.step(NOW);
+        let at_deviation = cell.joints_rad()[0];
+        cell.cancel();
+        assert!(cell.is_moving());
+        while cell.is_moving() {
+            cell.step(NOW);
         }
-        let braked = workcell.joints_rad()[0] - at_deviation;
+        let braked = cell.joints_rad()[0] - at_deviation;
         assert!(0.0 < braked && braked < 0.01, "{braked}");
 
-        let (mut workcell, _) = behaving(HardwareSettings {
+        let (mut cell, _) = behaving(HardwareSettings {
             servo_delay_s: 0.05,
             ..HardwareSettings::default()
         });
-        workcell
-            .begin(trajectory, false, &Joints::repeat(0.2))
-            .unwrap();
-        while workcell.step(NOW) == Step::Moving {}
-        assert!((workcell.joints_rad() - end).amax() < 1e-12);
+        cell.begin(trajectory, false, &Joints::repeat(0.2)).unwrap();
+        while cell.step(NOW) == Step::Moving {}
+        assert!((cell.joints_rad() - end).amax() < 1e-12);
     }
 
     #[test]
     fn without_tool_voltage_the_valve_has_no_power() {
-        let (mut workcell, _) = behaving(HardwareSettings {
+        let (mut cell, _) = behaving(HardwareSettings {
             tool_voltage: 0,
             ..HardwareSettings::default()
         });
-        workcell.set_io(&set(16, 1.0)).unwrap();
-        assert!(output(&workcell, 16) && !workcell.environment().cell().suction());
-        assert_eq!(workcell.tool_data().tool_output_voltage, 0);
+        cell.set_io(&set(16, 1.0)).unwrap();
+        assert!(output(&cell, 16) && !cell.environment().cell().suction());
+        assert_eq!(cell.tool_data().tool_output_voltage, 0);
         let request = SetIORequest {
             fun: SetIORequest::FUN_SET_TOOL_VOLTAGE,
             ..set(0, 24.0)
         };
-        workcell.set_io(&request).unwrap();
-        workcell.set_io(&set(16, 1.0)).unwrap();
-        assert!(workcell.environment().cell().suction());
-        assert_eq!(workcell.tool_data().tool_output_voltage, 24);
+        cell.set_io(&request).unwrap();
+        cell.set_io(&set(16, 1.0)).unwrap();
+        assert!(cell.environment().cell().suction());
+        assert_eq!(cell.tool_data().tool_output_voltage, 24);
     }
 }

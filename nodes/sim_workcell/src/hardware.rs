@@ -1,0 +1,444 @@
+//! The thread that owns the simulated hardware: what it is asked, one thing after the other, and what is wrong with it.
+
+mod goal;
+mod images;
+mod motion;
+mod reports;
+
+use std::sync::atomic::Ordering;
+use std::sync::{Arc, mpsc};
+use std::thread;
+use std::time::{Duration, Instant};
+
+use driver_model::{AcceptanceQueue, Answer, EncoderNoise, Fault, HardwareSettings};
+use msgs::rosgraph_msgs::Clock;
+use msgs::sctn_msgs::{ResetCellRequest, ResetCellResponse, Reward};
+use msgs::sensor_msgs::JointState;
+use msgs::std_msgs::{self, Bool};
+use msgs::tf2_msgs::TFMessage;
+use msgs::ur_dashboard_msgs::{RobotMode, SafetyMode};
+use msgs::ur_msgs::{FollowJointTrajectoryUntil, IOStates, SetIORequest, ToolDataMsg};
+use multiravens::Problem;
+use node_kit::{NewGoal, Node, Publisher, Qos, ReplyCache};
+use tokio::sync::oneshot;
+use tracing::{info, warn};
+use ur5::WorkCell;
+
+use self::goal::Activity;
+use self::reports::fixed_transforms;
+use crate::driver::{follow_trajectory, path_tolerances, until_trajectory};
+use crate::frames::{CameraTopics, Frame};
+use crate::node::{Command, Shared, controller_of};
+use crate::parameters::SimWorkcellParameters;
+use crate::simulated_cell::SimulatedCell;
+
+/// Detects contact; only robots with software 5 or later have it.
+const TOOL_CONTACT: &str = "tool_contact_controller";
+/// How often a dead driver looks whether it was started again.
+const DEAD_PERIOD: Duration = Duration::from_millis(20);
+
+/// The simulated hardware and where it speaks.
+pub(crate) struct Hardware {
+    node: Node,
+    parameters: SimWorkcellParameters,
+    /// Of the present episode; a reset may have begun another one than the parameter's.
+    problem: String,
+    cell: SimulatedCell,
+    work_cell: WorkCell,
+    commands: mpsc::Receiver<Command>,
+    shared: Arc<Shared>,
+    /// Goals of `trajectory_until_node` that wait for their answer.
+    unanswered: AcceptanceQueue<NewGoal<FollowJointTrajectoryUntil>>,
+    /// Replaces the trajectory that was under way.
+    next: Option<Command>,
+    /// Goals of a dead driver: nobody hears of their end.
+    orphans: Vec<Activity>,
+    noise: EncoderNoise,
+    /// What is wrong now.
+    fault: Fault,
+    /// The driver's process has ended by itself.
+    died: bool,
+    /// Origin of the times of the wall clock, and the simulated time then.
+    origin: (Instant, Duration),
+    clock: Publisher<Clock>,
+    joint_states: Publisher<JointState>,
+    /// Of the arm's links.
+    tf: Option<Publisher<TFMessage>>,
+    io_states: Publisher<IOStates>,
+    reward: Publisher<Reward>,
+    cameras: Vec<CameraTopics>,
+    /// Latched.
+    tf_static: Publisher<TFMessage>,
+    /// Latched, said once; kept so that late joiners hear them.
+    _robot_description: Option<Publisher<std_msgs::String>>,
+    robot_mode: Publisher<RobotMode>,
+    safety_mode: Publisher<SafetyMode>,
+    program_running: Publisher<Bool>,
+    tool_data: Publisher<ToolDataMsg>,
+    /// What the cameras saw at this rest: one set of frames of perfect cameras, several of noisy ones.
+    frames: Vec<Vec<(usize, Frame)>>,
+    /// Which set is said next.
+    next_set: usize,
+    /// Sets taken of noisy cameras so far.
+    sets_taken: u64,
+    resets: ReplyCache<ResetCellResponse>,
+    published_pins: IOStates,
+    /// When the last command ended.
+    last_command: Instant,
+    next_status: Instant,
+    next_pins: Instant,
+    next_frames: Instant,
+}
+
+/// Shortest and longest time until `trajectory_until_node` answers.
+fn answer_range(hardware: &HardwareSettings) -> (Duration, Duration) {
+    (
+        Duration::from_secs_f64(hardware.until_answer_min_s),
+        Duration::from_secs_f64(hardware.until_answer_max_s),
+    )
+}
+
+impl Hardware {
+    pub(crate) fn new(
+        node: &Node,
+        parameters: SimWorkcellParameters,
+        cell: SimulatedCell,
+        work_cell: WorkCell,
+        commands: mpsc::Receiver<Command>,
+        shared: Arc<Shared>,
+    ) -> anyhow::Result<Self> {
+        let cameras = cell.environment().cell().cameras();
+        let topics = cameras
+            .iter()
+            .map(|camera| CameraTopics::new(node, &camera.name));
+        let topics = topics.collect::<Result<_, _>>()?;
+        let tf_static = node.publisher("/tf_static", Qos::Latched)?;
+        let robot_description = match parameters.publish_robot {
+            false => None,
+            true => {
+                let description = node.publisher("robot_description", Qos::Latched)?;
+                description.publish(std_msgs::String {
+                    data: work_cell.urdf.clone(),
+                });
+                Some(description)
+            }
+        };
+        tf_static.publish(fixed_transforms(&cell, &work_cell, &parameters)?);
+        let status = |name| format!("io_and_status_controller/{name}");
+        let range = answer_range(&parameters.hardware);
+        let seed = parameters.seed;
+        let origin = (Instant::now(), cell.time());
+        let hardware = Self {
+            // Best effort: the readers of /clock that ros2-client makes acknowledge nothing.
+            clock: node.publisher("/clock", Qos::Image)?,
+            joint_states: node.publisher("joint_states", Qos::Event)?,
+            tf: match &robot_description {
+                Some(_) => Some(node.publisher("/tf", Qos::Event)?),
+                None => None,
+            },
+            _robot_description: robot_description,
+            io_states: node.publisher(&status("io_states"), Qos::Event)?,
+            reward: node.publisher("reward", Qos::Event)?,
+            node: node.clone(),
+            published_pins: cell.io_states(),
+            problem: parameters.problem.clone(),
+            parameters,
+            cell,
+            work_cell,
+            commands,
+            shared,
+            cameras: topics,
+            tf_static,
+            robot_mode: node.publisher(&status("robot_mode"), Qos::Latched)?,
+            safety_mode: node.publisher(&status("safety_mode"), Qos::Latched)?,
+            program_running: node.publisher(&status("robot_program_running"), Qos::Latched)?,
+            tool_data: node.publisher(&status("tool_data"), Qos::Event)?,
+            unanswered: AcceptanceQueue::new(range.0, range.1, seed),
+            next: None,
+            orphans: Vec::new(),
+            noise: EncoderNoise::new(seed),
+            fault: Fault::None,
+            died: false,
+            origin,
+            frames: Vec::new(),
+            next_set: 0,
+            sets_taken: 0,
+            resets: ReplyCache::default(),
+            last_command: Instant::now(),
+            next_status: Instant::now(),
+            next_pins: Instant::now(),
+            next_frames: Instant::now(),
+        };
+        hardware.publish_modes();
+        Ok(hardware)
+    }
+
+    pub(crate) fn run(&mut self) -> anyhow::Result<()> {
+        // What waited while nothing was active is refused.
+        while self.commands.try_recv().is_ok() {}
+        info!("problem {}: ready at {:?}", self.problem, self.cell.time());
+        self.origin = (Instant::now(), self.cell.time());
+        self.publish_scene()?;
+        while !self.is_stopped() {
+            self.take_parameters();
+            if self.is_dead() {
+                // What comes now waits, and is forgotten when the driver is started again.
+                thread::sleep(DEAD_PERIOD);
+                continue;
+            }
+            self.run_on()?;
+            self.answer_goals()?;
+            let next = self.next_status.min(self.next_pins).min(self.next_frames);
+            let due = self.unanswered.due().map(|due| self.origin.0 + due);
+            let next = due.map_or(next, |due| next.min(due));
+            let command = match self.next.take() {
+                Some(command) => Ok(command),
+                None => self
+                    .commands
+                    .recv_timeout(next.saturating_duration_since(Instant::now())),
+            };
+            match command {
+                Ok(command) => {
+                    self.handle(command)?;
+                    self.last_command = Instant::now();
+                    let soon = self.after(self.status_period_s());
+                    self.next_status = self.next_status.min(soon);
+                    self.next_pins = self.next_pins.min(soon);
+                }
+                Err(mpsc::RecvTimeoutError::Timeout) => {}
+                Err(mpsc::RecvTimeoutError::Disconnected) => break,
+            }
+            let now = Instant::now();
+            if now >= self.next_status {
+                self.publish_state()?;
+            }
+            if now >= self.next_pins {
+                self.publish_pins();
+            }
+            if now >= self.next_frames {
+                if self.parameters.hardware.free_running
+                    && self.next_set == 0
+                    && self.cell.is_at_rest()
+                {
+                    // A camera does not repeat images.
+                    self.render()?;
+                }
+                self.publish_frames();
+            }
+        }
+        Ok(())
+    }
+
+    fn handle(&mut self, command: Command) -> anyhow::Result<()> {
+        let (arm, names) = (&self.work_cell.arm, &self.work_cell.joint_names);
+        let default_rad = self.parameters.hardware.path_tolerance_rad;
+        match command {
+            Command::Follow(goal) => {
+                if let Some(reason) = self.inactive(controller_of(&self.parameters.follow_action)) {
+                    goal.reject(reason);
+                    return Ok(());
+                }
+                let (goal, running) = goal.accept();
+                let tolerances = path_tolerances(&goal.path_tolerance, names, default_rad);
+                let trajectory = follow_trajectory(&goal, arm, names);
+                self.carry_out(Activity::Follow(running), trajectory, false, &tolerances)
+            }
+            Command::Until(goal) => {
+                self.unanswered.push(goal, self.now());
+                self.answer_goals()
+            }
+            Command::Die => {
+                self.end_driver();
+                Ok(())
+            }
+            Command::SetIo(request, reply) => {
+                self.set_io(&request, reply);
+                Ok(())
+            }
+            Command::Reset(request, reply) => {
+                let answer = self.reset(&request)?;
+                // The caller may have gone.
+                let _ = reply.send(answer);
+                Ok(())
+            }
+        }
+    }
+
+    /// Answers the goals of `trajectory_until_node` whose time has come.
+    fn answer_goals(&mut self) -> anyhow::Result<()> {
+        while let Some(answer) = self.unanswered.pop(self.now(), false) {
+            // A goal is carried out before the next one has its turn.
+            let (Answer::Accept(goal) | Answer::Busy(goal)) = answer;
+            let follow = controller_of(&self.parameters.follow_action);
+            let inactive = self
+                .inactive(follow)
+                .or_else(|| self.inactive(TOOL_CONTACT));
+            if let Some(reason) = inactive {
+                goal.reject(reason);
+                continue;
+            }
+            let (goal, running) = goal.accept();
+            let (arm, names) = (&self.work_cell.arm, &self.work_cell.joint_names);
+            let default_rad = self.parameters.hardware.path_tolerance_rad;
+            let tolerances = path_tolerances(&goal.path_tolerance, names, default_rad);
+            let trajectory = until_trajectory(&goal, arm, names);
+            self.carry_out(Activity::Until(running), trajectory, true, &tolerances)?;
+        }
+        Ok(())
+    }
+
+    /// Why a controller takes no goals.
+    fn inactive(&self, controller: &str) -> Option<String> {
+        if !self.fault.modes().program_running {
+            return Some(format!("{controller} does not run: {:?}", self.fault));
+        }
+        let active = self.shared.controllers().is_active(controller);
+        (!active).then(|| format!("{controller} is not active"))
+    }
+
+    /// What can be obeyed while a goal is active. Returns what ends that goal.
+    fn handle_while_moving(&mut self, command: Command) -> Option<Command> {
+        let reason = "another goal is active";
+        match command {
+            // A trajectory controller takes the newest.
+            Command::Follow(_) if self.parameters.hardware.strict_actions => return Some(command),
+            Command::Follow(goal) => goal.reject(reason),
+            Command::Until(goal) => self.unanswered.push(goal, self.now()),
+            Command::Die => return Some(command),
+            Command::SetIo(request, reply) => self.set_io(&request, reply),
+            Command::Reset(request, reply) => {
+                let refusal = |message| ResetCellResponse {
+                    message,
+                    ..Default::default()
+                };
+                let known = self.resets.known(&request.request_id, refusal);
+                let answer = known.unwrap_or_else(|| refusal(format!("{reason}: cancel it first")));
+                let _ = reply.send(answer);
+            }
+        }
+        None
+    }
+
+    /// Rejects the goals of `trajectory_until_node` whose time has come while another goal is active.
+    fn reject_goals(&mut self) {
+        while let Some(answer) = self.unanswered.pop(self.now(), true) {
+            let (Answer::Accept(goal) | Answer::Busy(goal)) = answer;
+            goal.reject("another goal is active");
+        }
+    }
+
+    /// Begins an episode; only failures to speak of it are errors.
+    fn reset(&mut self, request: &ResetCellRequest) -> anyhow::Result<ResetCellResponse> {
+        let refusal = |message: String| {
+            warn!("reset: {message}");
+            ResetCellResponse {
+                message,
+                ..Default::default()
+            }
+        };
+        if let Some(answer) = self.resets.known(&request.request_id, refusal) {
+            return Ok(answer);
+        }
+        let name = match request.problem.as_str() {
+            "" => self.problem.clone(),
+            name => name.to_owned(),
+        };
+        let seed = request.seed;
+        let begun = Problem::load(&self.parameters.problems_dir, &name)
+            .map_err(|error| error.to_string())
+            .and_then(|problem| {
+                let begun = self.cell.reset(&problem, &self.work_cell, seed);
+                begun.map_err(|error| error.to_string())
+            });
+        let answer = match begun {
+            Ok(()) => {
+                info!("reset: problem {name}, seed {seed}");
+                self.problem = name;
+                if self.cell.environment().rig().is_some() {
+                    // The errors of the calibration are those of the seed.
+                    self.tf_static.publish(fixed_transforms(
+                        &self.cell,
+                        &self.work_cell,
+                        &self.parameters,
+                    )?);
+                }
+                self.publish_pins();
+                self.publish_state()?;
+                self.publish_scene()?;
+                ResetCellResponse {
+                    success: true,
+                    stamp: self.header()?.stamp,
+                    ..Default::default()
+                }
+            }
+            Err(reason) => refusal(reason),
+        };
+        self.resets.remember(&request.request_id, answer.clone());
+        Ok(answer)
+    }
+
+    fn set_io(&mut self, request: &SetIORequest, reply: oneshot::Sender<bool>) {
+        let done = self.cell.set_io(request);
+        if let Err(reason) = &done {
+            warn!("set_io: {reason}");
+        }
+        // The new state is out before the reply is.
+        self.publish_changed_pins();
+        // The caller may have gone.
+        let _ = reply.send(done.is_ok());
+    }
+
+    /// Time of the wall clock, from an origin of its own.
+    fn now(&self) -> Duration {
+        self.origin.0.elapsed()
+    }
+
+    fn is_stopped(&self) -> bool {
+        self.shared.stop.load(Ordering::Acquire)
+    }
+
+    fn is_dead(&self) -> bool {
+        self.died || self.fault == Fault::DriverDead
+    }
+
+    /// The driver's process is gone: the robot stops by itself, and nobody hears of it.
+    fn end_driver(&mut self) {
+        self.died = true;
+        self.shared.dead.store(true, Ordering::Release);
+    }
+
+    /// The parameters that may be set at run time.
+    fn take_parameters(&mut self) {
+        let parameters = self.node.parameters::<SimWorkcellParameters>();
+        let unchanged = *parameters.borrow() == self.parameters;
+        if unchanged && self.parameters.hardware.fault == self.fault {
+            return;
+        }
+        self.parameters = parameters.borrow().clone();
+        let hardware = &self.parameters.hardware;
+        self.cell.set_hardware(hardware);
+        let range = answer_range(hardware);
+        self.unanswered.set_range(range.0, range.1);
+        let (before, fault) = (self.fault, hardware.fault);
+        if before == fault {
+            return;
+        }
+        warn!("hardware.fault is {fault:?}, was {before:?}");
+        self.fault = fault;
+        self.shared.dead.store(self.is_dead(), Ordering::Release);
+        if before == Fault::DriverDead && !self.died {
+            // Started again, it knows nothing of what was.
+            for goal in self.unanswered.clear() {
+                goal.reject("the driver was started again");
+            }
+            while self.commands.try_recv().is_ok() {}
+            self.orphans.clear();
+            self.next_status = Instant::now();
+        }
+        self.publish_modes();
+    }
+
+    fn after(&self, period_s: f64) -> Instant {
+        Instant::now() + Duration::from_secs_f64(period_s)
+    }
+}

@@ -24,17 +24,15 @@ def free_domain() -> int:
 
     Ids above 100 would use ports that the kernel hands out to others.
     """
-    start = os.getpid() + free_domain.calls
-    free_domain.calls += 1
-    for offset in range(100):
-        domain = 1 + (start + offset) % 100
+    for domain in [1 + (free_domain.next + offset) % 100 for offset in range(100)]:
         ports = [7400 + 250 * domain + port for port in (0, 1, *range(10, 34))]
         if all(_is_free(port) for port in ports) and _claim(domain):
+            free_domain.next = domain
             return domain
     raise RuntimeError("no free ROS domain id between 1 and 100")
 
 
-free_domain.calls = 0
+free_domain.next = os.getpid()
 # The lock of each domain id that was given out, held until this process ends.
 _claims: dict[int, IO[bytes]] = {}
 

@@ -5,6 +5,7 @@ use anyhow::{Context, Result, bail};
 use bags::Demonstration;
 use clap::Args;
 use gctn::{Goal, GoalConditioning, Policy};
+use heightmap::Heightmap;
 use learning::recorded_run;
 use pick_place::PickPlace;
 use serde::Serialize;
@@ -19,6 +20,9 @@ pub struct Compare {
     /// Bags with steps that none of them was trained on: demonstrations, taught tasks or recorded runs
     #[arg(long, required = true, num_args = 1..)]
     demos: Vec<PathBuf>,
+    /// What the policies are shown of each of them: a demonstration of its scene, with its goals in the same order, from another start [default: itself]
+    #[arg(long, num_args = 1..)]
+    shown: Vec<PathBuf>,
     /// Print a JSON object last
     #[arg(long)]
     json: bool,
@@ -69,8 +73,15 @@ impl Compare {
         let policies = self.checkpoints.iter().map(load);
         let policies: Vec<_> = policies.collect::<Result<_>>()?;
         let mut steps = Vec::new();
-        for path in &self.demos {
-            compare(path, &policies, &mut steps)?;
+        if !self.shown.is_empty() && self.shown.len() != self.demos.len() {
+            let (shown, demos) = (self.shown.len(), self.demos.len());
+            bail!(
+                "--shown: {shown} demonstrations, expected one for each of the {demos} of --demos"
+            );
+        }
+        for (index, path) in self.demos.iter().enumerate() {
+            let shown = self.shown.get(index).unwrap_or(path);
+            compare(path, shown, &policies, &mut steps)?;
         }
         if steps.is_empty() {
             bail!("--demos: no step that brought the table closer to the goal");
@@ -112,22 +123,29 @@ impl Compare {
     }
 }
 
-/// Has every policy propose for every step of a demonstration that brought the table closer to the goal.
-fn compare(path: &Path, policies: &[Policy], steps: &mut Vec<Step>) -> Result<()> {
-    let bag =
-        recorded_run(path).with_context(|| format!("--demos: {} holds no bag", path.display()))?;
-    let demonstration = Demonstration::read(&bag)?;
-    // The image before the step: what was seen when the step before it was done.
-    let mut previous = 0;
-    for (index, step) in demonstration.steps.iter().enumerate() {
-        if step.delta_reward <= 0.0 {
-            continue;
-        }
-        let (before, after) = (
-            demonstration.observation(previous),
-            demonstration.observation(index + 1),
+/// Has every policy propose for every step of a demonstration that brought the table closer to the goal, by the images of the
+/// step of that number that brought the shown one closer to its goal.
+fn compare(path: &Path, shown: &Path, policies: &[Policy], steps: &mut Vec<Step>) -> Result<()> {
+    let read = |path: &Path, option: &str| -> Result<Demonstration> {
+        let bag = recorded_run(path)
+            .with_context(|| format!("{option}: {} holds no bag", path.display()))?;
+        Ok(Demonstration::read(&bag)?)
+    };
+    let demonstration = read(path, "--demos")?;
+    let shown_demonstration = read(shown, "--shown")?;
+    let goals = goals_of(&shown_demonstration);
+    let progress = earning_steps(&demonstration);
+    if progress.len() != goals.len() {
+        bail!(
+            "--shown: {} has {} steps that brought the table closer to the goal, expected {}, as {} has",
+            shown.display(),
+            goals.len(),
+            progress.len(),
+            path.display()
         );
-        previous = index + 1;
+    }
+    for (index, (before, after)) in progress.into_iter().zip(goals) {
+        let step = &demonstration.steps[index];
         let distance = |policy: &Policy| {
             let goal = match policy.config().conditioning {
                 GoalConditioning::Sequence => Goal::step(before, after),
@@ -150,6 +168,30 @@ fn compare(path: &Path, policies: &[Policy], steps: &mut Vec<Step>) -> Result<()
         });
     }
     Ok(())
+}
+
+/// Indices of the steps that brought the table closer to the goal.
+fn earning_steps(demonstration: &Demonstration) -> Vec<usize> {
+    let steps = demonstration.steps.iter().enumerate();
+    let earning = steps.filter(|(_, step)| step.delta_reward > 0.0);
+    earning.map(|(index, _)| index).collect()
+}
+
+/// The images before and after each of these steps. The one before shows what the step before it has done.
+fn goals_of(demonstration: &Demonstration) -> Vec<(&Heightmap, &Heightmap)> {
+    let ends = earning_steps(demonstration)
+        .into_iter()
+        .map(|index| index + 1);
+    let begins = std::iter::once(0).chain(ends.clone());
+    let images = begins.zip(ends);
+    images
+        .map(|(before, after)| {
+            (
+                demonstration.observation(before),
+                demonstration.observation(after),
+            )
+        })
+        .collect()
 }
 
 #[cfg(test)]

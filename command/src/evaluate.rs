@@ -47,6 +47,10 @@ pub struct Evaluate {
     /// scores and place scores, with the poses decided on
     #[arg(long)]
     failures: Option<PathBuf>,
+    /// Folder for the shown demonstrations: each is simulated once and read by later evaluations of the same program, problem and
+    /// perturbation [default: none are kept]
+    #[arg(long)]
+    shown: Option<PathBuf>,
     /// Print the report as a JSON object last
     #[arg(long)]
     json: bool,
@@ -106,6 +110,7 @@ impl Evaluate {
             &mut actors,
             &plan,
             perturbation.as_ref(),
+            self.shown.as_deref(),
             |report, attempt| {
                 bar.inc(1);
                 if self.failures.is_some() && !report.completed {

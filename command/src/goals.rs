@@ -92,7 +92,7 @@ impl Goals {
         let mut seed = self.seed;
         while report.policy.episodes < self.episodes {
             // A seed that the demonstrator fails on has no sequence.
-            if let Some(attempt) = attempt(&mut environment, &actor, seed, Start::Same)? {
+            if let Some(attempt) = attempt(&mut environment, &actor, seed, Start::Same, None)? {
                 let shown = &attempt.shown;
                 let known = known_images(shown);
                 let rollout = &attempt.rollout.demonstration;

@@ -97,7 +97,8 @@ impl SearchCommand {
         let folder = self.out.join("trials").join(format!("{number:03}"));
         let resume = folder.join("state.safetensors").exists();
         let demos = std::slice::from_ref(&self.demos);
-        let snapshots = train(root, recipe.clone(), demos, &folder, resume)?;
+        let shown = self.out.join("shown");
+        let snapshots = train(root, recipe.clone(), demos, &folder, &shown, resume)?;
         let episodes = recipe.validation.episodes;
         let first = |rates: &BTreeMap<String, f64>| rates.values().next().copied().unwrap_or(0.0);
         let snapshots = snapshots.iter().map(|snapshot| TrialSnapshot {

@@ -83,6 +83,11 @@ impl SweepCommand {
         Ok(())
     }
 
+    /// Folder of the demonstrations that evaluations show: the same for all runs.
+    fn shown(&self) -> PathBuf {
+        self.out.join("shown")
+    }
+
     fn one(&self, root: &Root, sweep: &Sweep, run: &Run, recipe: Recipe) -> Result<RunResult> {
         let started = ProcessTime::now();
         let folder = self.out.join("runs").join(run.slug());
@@ -92,6 +97,7 @@ impl SweepCommand {
             recipe.clone(),
             std::slice::from_ref(&self.demos),
             &folder,
+            &self.shown(),
             resume,
         )?;
         let problem = root.problem(&run.problem)?;
@@ -107,9 +113,16 @@ impl SweepCommand {
                 start: Start::Same,
             };
             let bar = progress::bar(episodes as u64, "episodes");
-            let report = evaluate(&problem, &work_cell, &mut actors, &plan, None, |_, _| {
-                bar.inc(1)
-            })?;
+            let shown = Some(self.shown());
+            let report = evaluate(
+                &problem,
+                &work_cell,
+                &mut actors,
+                &plan,
+                None,
+                shown.as_deref(),
+                |_, _| bar.inc(1),
+            )?;
             bar.finish_and_clear();
             Ok(Score {
                 episodes: report.episodes,

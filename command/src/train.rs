@@ -9,8 +9,8 @@ use clap::Args;
 use gctn::{GoalConditioning, ModelCard, Policy};
 use indicatif::HumanDuration;
 use learning::{
-    Actor, DataSet, Demonstrations, Episodes, EventFile, Recipe, Start, Training, evaluate,
-    recorded_run,
+    Actor, DataSet, Demonstrations, Episodes, EventFile, ImageMemory, Recipe, Start, Training,
+    evaluate, recorded_run,
 };
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
@@ -94,7 +94,8 @@ impl Train {
             recipe.start_from = Some(checkpoint);
         }
         let average = recipe.average as usize;
-        let snapshots = train(root, recipe, &self.demos, &self.out, self.resume)?;
+        let shown = self.out.join("shown");
+        let snapshots = train(root, recipe, &self.demos, &self.out, &shown, self.resume)?;
         let best = snapshots.iter().max_by(|a, b| {
             a.rank()
                 .partial_cmp(&b.rank())
@@ -127,8 +128,12 @@ impl Train {
 }
 
 /// The demonstrations of one folder that `sctn demos` wrote, or of recorded runs.
-fn load(demos: &[PathBuf], recipe: &mut Recipe) -> Result<DataSet> {
-    let mut data = DataSet::new(recipe.decoded_mb);
+fn load(demos: &[PathBuf], recipe: &mut Recipe, out: &Path) -> Result<DataSet> {
+    let memory = ImageMemory {
+        decoded_mb: recipe.decoded_mb,
+        compressed_mb: recipe.compressed_mb,
+    };
+    let mut data = DataSet::new(memory, out);
     let runs: Vec<PathBuf> = demos.iter().filter_map(|path| recorded_run(path)).collect();
     if runs.is_empty() {
         let [folder] = demos else {
@@ -171,22 +176,24 @@ fn load(demos: &[PathBuf], recipe: &mut Recipe) -> Result<DataSet> {
     Ok(data)
 }
 
-/// Trains by a recipe in a folder, or goes on with what the folder holds; gives all snapshots.
+/// Trains by a recipe in a folder, or goes on with what the folder holds; gives all snapshots. The demonstrations that validation
+/// shows are kept in the folder `shown`.
 pub fn train(
     root: &Root,
     mut recipe: Recipe,
     demos: &[PathBuf],
     out: &Path,
+    shown: &Path,
     resume: bool,
 ) -> Result<Vec<Snapshot>> {
     root.check_trainable(&recipe.problems)?;
-    let data = load(demos, &mut recipe)?;
+    let data = load(demos, &mut recipe, out)?;
+    let [memory, file] = data.image_bytes().map(|bytes| bytes as f64 / 1e6);
     tracing::info!(
-        "{} demonstrations of {} scenes, {} steps, {:.0} MB of images",
+        "{} demonstrations of {} scenes, {} steps, {memory:.0} MB of images in memory, {file:.0} MB in a file",
         data.len(),
         data.scene_count(),
         data.step_count(),
-        data.image_bytes() as f64 / 1e6
     );
     let asked = recipe.training.precision;
     let precision = asked.on(recipe.training.device);
@@ -250,7 +257,7 @@ pub fn train(
                 reward: BTreeMap::new(),
             };
             (pick, place, count) = (0.0, 0.0, 0);
-            bar.suspend(|| validate(root, training.recipe(), &mut snapshot))?;
+            bar.suspend(|| validate(root, training.recipe(), shown, &mut snapshot))?;
             for (problem, completion) in &snapshot.completion {
                 let tag = format!("validation/{problem}");
                 let scalars = [(tag.as_str(), *completion)];
@@ -283,7 +290,7 @@ fn card(training: &Training) -> ModelCard {
 }
 
 /// Lets a snapshot act on the validation episodes of every problem.
-fn validate(root: &Root, recipe: &Recipe, snapshot: &mut Snapshot) -> Result<()> {
+fn validate(root: &Root, recipe: &Recipe, shown: &Path, snapshot: &mut Snapshot) -> Result<()> {
     if recipe.validation.episodes == 0 {
         return Ok(());
     }
@@ -306,7 +313,15 @@ fn validate(root: &Root, recipe: &Recipe, snapshot: &mut Snapshot) -> Result<()>
     };
     for name in &recipe.problems {
         let problem = root.problem(name)?;
-        let report = evaluate(&problem, &work_cell, &mut actors, &plan, None, |_, _| ())?;
+        let report = evaluate(
+            &problem,
+            &work_cell,
+            &mut actors,
+            &plan,
+            None,
+            Some(shown),
+            |_, _| (),
+        )?;
         tracing::info!("step {}: {}", snapshot.step, summary(&report));
         snapshot.completion.insert(name.clone(), report.completion);
         snapshot.reward.insert(name.clone(), report.reward);

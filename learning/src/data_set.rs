@@ -1,6 +1,6 @@
 //! Demonstrations as training samples.
 
-use crate::images::{ImageId, ImageStore};
+use crate::images::{ImageId, ImageMemory, ImageStore};
 use crate::sampling::{Sampling, SamplingError};
 use bags::{Demonstration, DemonstrationError};
 use gctn::{Goal, GoalConditioning, Sample};
@@ -13,7 +13,7 @@ use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
 use std::sync::Arc;
 
-/// Demonstrations in memory, their images compressed, and which of their steps can be learned from.
+/// Demonstrations, their images compressed, and which of their steps can be learned from.
 #[derive(Debug)]
 pub struct DataSet {
     demonstrations: Vec<Indexed>,
@@ -23,9 +23,9 @@ pub struct DataSet {
 }
 
 impl Default for DataSet {
-    /// Keeps 512 MB of decoded images.
+    /// With the usual bounds, and a file for what is beyond them in the folder for temporary files.
     fn default() -> Self {
-        Self::new(512)
+        Self::new(ImageMemory::default(), &std::env::temp_dir())
     }
 }
 
@@ -190,11 +190,12 @@ pub fn recorded_run(folder: &Path) -> Option<PathBuf> {
 }
 
 impl DataSet {
-    /// An empty data set that keeps at most so many MB of decoded images, besides all of them compressed.
-    pub fn new(decoded_mb: usize) -> Self {
+    /// An empty data set that keeps so much of its images in memory. What is beyond lies in a file without a name in `folder`,
+    /// which disappears with the process.
+    pub fn new(memory: ImageMemory, folder: &Path) -> Self {
         Self {
             demonstrations: Vec::new(),
-            images: ImageStore::new(decoded_mb.saturating_mul(1_000_000)),
+            images: ImageStore::new(memory, folder),
             scenes: BTreeMap::new(),
         }
     }
@@ -350,9 +351,9 @@ impl DataSet {
         self.scenes.len()
     }
 
-    /// Bytes that the compressed images take.
-    pub fn image_bytes(&self) -> usize {
-        self.images.packed_bytes()
+    /// Bytes that the compressed images take, in memory and in a file.
+    pub fn image_bytes(&self) -> [u64; 2] {
+        self.images.compressed_bytes()
     }
 
     fn image(&self, id: ImageId) -> Result<Arc<Heightmap>, DataSetError> {

@@ -3,12 +3,14 @@
 use crate::actor::{Act, Actor, Said};
 use crate::goal::goal;
 use crate::interval::bootstrap_95;
-use crate::rollout::{Rollout, demonstrate, roll_out};
+use crate::rollout::{Rollout, roll_out};
+use crate::shown::{ShownError, ShownFolder, shown};
 use bags::Demonstration;
 use camera_noise::Perturbation;
 use multiravens::{Environment, EnvironmentError, EpisodeSeed, Problem};
 use serde::{Deserialize, Serialize};
 use std::cell::RefCell;
+use std::path::Path;
 use std::sync::Mutex;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Instant;
@@ -127,6 +129,9 @@ pub enum EvaluationError {
         /// Why.
         source: Box<EnvironmentError>,
     },
+    /// The folder of shown demonstrations.
+    #[error(transparent)]
+    Shown(#[from] ShownError),
     /// The policy failed.
     #[error("seed {seed}: {source}")]
     Policy {
@@ -175,29 +180,30 @@ pub struct Attempt {
 }
 
 /// Lets an actor act on the episode of a scene's own start, shown a demonstration. A pick that has just failed is left
-/// out, see [`FailedPicks`]. `None`: the demonstrator failed on this seed.
+/// out, see [`FailedPicks`]. The demonstration is kept in the folder where there is one. `None`: the demonstrator failed on this seed.
 pub fn attempt(
     environment: &mut Environment,
     actor: &Actor,
     seed: u64,
     start: Start,
+    folder: Option<&ShownFolder>,
 ) -> Result<Option<Attempt>, EvaluationError> {
-    let failed = |error| EvaluationError::Environment {
-        seed,
-        source: Box::new(error),
-    };
     environment.set_session(SESSION_OF_DEMONSTRATION);
-    let shown = demonstrate(environment, start.shown(seed)).map_err(failed)?;
-    if !shown.complete {
+    let seeds = start.shown(seed);
+    let demonstration = match folder {
+        Some(folder) => folder.demonstrate(environment, seeds)?,
+        None => shown(environment, seeds)?,
+    };
+    let Some(demonstration) = demonstration else {
         return Ok(None);
-    }
+    };
     environment.set_session(SESSION_OF_ROLLOUT);
-    let goals = shown.demonstration.goals();
+    let goals = demonstration.goals();
     let conditioning = actor.conditioning();
     let oracle = RefCell::new(ReachedGoals::new(goals.len()));
     let failed_picks: RefCell<FailedPicks> = RefCell::default();
     let said: RefCell<Option<Act>> = RefCell::default();
-    let first = shown.demonstration.observation(0);
+    let first = demonstration.observation(0);
     let mut image_distance_right = 0;
     let said_steps: RefCell<Vec<SaidStep>> = RefCell::default();
     let rollout = roll_out(
@@ -243,24 +249,29 @@ pub fn attempt(
     );
     match rollout {
         Ok(rollout) => Ok(Some(Attempt {
-            shown: shown.demonstration,
+            shown: demonstration,
             rollout,
             image_distance_right,
             said: said_steps.into_inner(),
         })),
-        Err(StepError::Environment(source)) => Err(failed(source)),
+        Err(StepError::Environment(source)) => Err(EvaluationError::Environment {
+            seed,
+            source: Box::new(source),
+        }),
         Err(StepError::Policy(source)) => Err(EvaluationError::Policy { seed, source }),
     }
 }
 
 /// Evaluates on episodes. One thread for each actor given, which must all be alike; the result does not depend on how
-/// many. With a perturbation, observations and goals are what such cameras see. `progress` is called after each episode.
+/// many. With a perturbation, observations and goals are what such cameras see. Where `shown` names a folder, the shown
+/// demonstrations are kept in it, see [`ShownFolder`]; it changes no result. `progress` is called after each episode.
 pub fn evaluate(
     problem: &Problem,
     work_cell: &WorkCell,
     actors: &mut [Actor],
     plan: &Episodes,
     perturbation: Option<&Perturbation>,
+    shown: Option<&Path>,
     progress: impl Fn(&EpisodeReport, &Attempt) + Sync,
 ) -> Result<Evaluation, EvaluationError> {
     let Episodes {
@@ -269,6 +280,8 @@ pub fn evaluate(
         start,
     } = *plan;
     let started = Instant::now();
+    let folder = shown.map(|folder| ShownFolder::new(folder, problem, work_cell, perturbation));
+    let folder = folder.transpose()?;
     let next = AtomicU64::new(0);
     let outcomes = Mutex::new(Vec::new());
     // Seeds are handed out in order, and more of them while some are passed over; what comes after the
@@ -295,18 +308,19 @@ pub fn evaluate(
                 });
             }
             let seed = first_seed + 2 * index;
-            let report = attempt(&mut environment, actor, seed, start)?.map(|attempt| {
-                let report = EpisodeReport {
-                    seed,
-                    completed: attempt.rollout.complete,
-                    reward: attempt.rollout.total_reward,
-                    steps: attempt.rollout.demonstration.steps.len(),
-                    image_distance_right: attempt.image_distance_right,
-                    said: attempt.said.clone(),
-                };
-                progress(&report, &attempt);
-                report
-            });
+            let report =
+                attempt(&mut environment, actor, seed, start, folder.as_ref())?.map(|attempt| {
+                    let report = EpisodeReport {
+                        seed,
+                        completed: attempt.rollout.complete,
+                        reward: attempt.rollout.total_reward,
+                        steps: attempt.rollout.demonstration.steps.len(),
+                        image_distance_right: attempt.image_distance_right,
+                        said: attempt.said.clone(),
+                    };
+                    progress(&report, &attempt);
+                    report
+                });
             outcomes
                 .lock()
                 .expect("no thread panics with the lock")

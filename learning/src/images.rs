@@ -1,7 +1,11 @@
-//! Images of demonstrations in memory: compressed, and the ones used last decoded as well.
+//! Images of demonstrations: compressed in memory or in a file, and the ones used last decoded.
 
 use heightmap::{Heightmap, Workspace};
+use std::borrow::Cow;
 use std::collections::HashMap;
+use std::fs::File;
+use std::os::unix::fs::FileExt;
+use std::path::{Path, PathBuf};
 use std::sync::{Arc, Mutex, PoisonError};
 
 /// Fast, and within a tenth of the size of the slow levels.
@@ -10,18 +14,85 @@ const LEVEL: i32 = 1;
 /// Index of an image in its store.
 pub(crate) type ImageId = usize;
 
+/// How much memory the images of a data set take.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct ImageMemory {
+    /// Most MB of images that are kept decoded.
+    pub decoded_mb: usize,
+    /// Most MB of compressed images that are kept in memory; the others lie in a file.
+    pub compressed_mb: usize,
+}
+
+impl Default for ImageMemory {
+    fn default() -> Self {
+        Self {
+            decoded_mb: 512,
+            compressed_mb: 2000,
+        }
+    }
+}
+
 /// Heightmaps, compressed without loss. Decoded ones are kept within a bound, the one used longest ago goes first.
 #[derive(Debug)]
 pub(crate) struct ImageStore {
     packed: Vec<Packed>,
     decoded: Mutex<Decoded>,
-    bound_bytes: usize,
+    decoded_bound: usize,
+    /// Bytes of compressed images in memory.
+    compressed_bytes: usize,
+    compressed_bound: usize,
+    overflow: Overflow,
+    buffer: Vec<u8>,
+}
+
+/// Compressed images beyond the bound, one after the other in a file without a name, which disappears with the process.
+#[derive(Debug)]
+struct Overflow {
+    /// Where the file is made when it is needed.
+    folder: PathBuf,
+    file: Option<File>,
+    bytes: u64,
+}
+
+impl Overflow {
+    fn append(&mut self, bytes: &[u8]) -> std::io::Result<Place> {
+        let file = match &self.file {
+            Some(file) => file,
+            None => {
+                std::fs::create_dir_all(&self.folder)?;
+                self.file.insert(tempfile::tempfile_in(&self.folder)?)
+            }
+        };
+        file.write_all_at(bytes, self.bytes)?;
+        let place = Place::File {
+            offset: self.bytes,
+            len: bytes.len(),
+        };
+        self.bytes += bytes.len() as u64;
+        Ok(place)
+    }
+
+    fn read(&self, offset: u64, len: usize) -> std::io::Result<Vec<u8>> {
+        let mut bytes = vec![0; len];
+        match &self.file {
+            Some(file) => file.read_exact_at(&mut bytes, offset)?,
+            None => return Err(std::io::ErrorKind::NotFound.into()),
+        }
+        Ok(bytes)
+    }
 }
 
 #[derive(Debug)]
 struct Packed {
     workspace: Workspace,
-    bytes: Vec<u8>,
+    place: Place,
+}
+
+/// Where a compressed image lies.
+#[derive(Debug)]
+enum Place {
+    Memory(Box<[u8]>),
+    File { offset: u64, len: usize },
 }
 
 #[derive(Debug, Default)]
@@ -37,12 +108,27 @@ fn bytes_of(heightmap: &Heightmap) -> usize {
 }
 
 impl ImageStore {
-    /// An empty store that keeps at most so many bytes of decoded images.
-    pub fn new(bound_bytes: usize) -> Self {
+    /// An empty store, which makes its file in this folder.
+    pub fn new(memory: ImageMemory, folder: &Path) -> Self {
+        let [decoded, compressed] =
+            [memory.decoded_mb, memory.compressed_mb].map(|mb| mb.saturating_mul(1_000_000));
+        Self::with_bounds(decoded, compressed, folder)
+    }
+
+    /// Bounds in bytes.
+    fn with_bounds(decoded_bound: usize, compressed_bound: usize, folder: &Path) -> Self {
         Self {
             packed: Vec::new(),
             decoded: Mutex::default(),
-            bound_bytes,
+            decoded_bound,
+            compressed_bytes: 0,
+            compressed_bound,
+            overflow: Overflow {
+                folder: folder.to_owned(),
+                file: None,
+                bytes: 0,
+            },
+            buffer: Vec::new(),
         }
     }
 
@@ -55,9 +141,19 @@ impl ImageStore {
         for index in 0..4 {
             bytes.extend(heights.iter().map(|height| height[index]));
         }
+        // Compressed in a buffer that is used again: a vector from `zstd::bulk::compress` keeps the room of the worst case.
+        self.buffer
+            .resize(zstd::zstd_safe::compress_bound(bytes.len()), 0);
+        let len = zstd::bulk::compress_to_buffer(&bytes, &mut self.buffer, LEVEL)?;
+        let place = if self.compressed_bytes + len <= self.compressed_bound {
+            self.compressed_bytes += len;
+            Place::Memory(self.buffer[..len].into())
+        } else {
+            self.overflow.append(&self.buffer[..len])?
+        };
         self.packed.push(Packed {
             workspace: heightmap.workspace,
-            bytes: zstd::bulk::compress(&bytes, LEVEL)?,
+            place,
         });
         Ok(self.packed.len() - 1)
     }
@@ -71,9 +167,9 @@ impl ImageStore {
             *used = now;
             return Ok(Arc::clone(image));
         }
-        let image = Arc::new(self.packed[id].open()?);
+        let image = Arc::new(self.open(id)?);
         let bytes = bytes_of(&image);
-        while decoded.bytes + bytes > self.bound_bytes {
+        while decoded.bytes + bytes > self.decoded_bound {
             let oldest = decoded.images.iter().min_by_key(|(_, (_, used))| *used);
             let Some(oldest) = oldest.map(|(id, _)| *id) else {
                 // Larger than the bound alone: not kept.
@@ -88,9 +184,9 @@ impl ImageStore {
         Ok(image)
     }
 
-    /// Bytes of the compressed images.
-    pub fn packed_bytes(&self) -> usize {
-        self.packed.iter().map(|packed| packed.bytes.len()).sum()
+    /// Bytes of the compressed images, in memory and in the file.
+    pub fn compressed_bytes(&self) -> [u64; 2] {
+        [self.compressed_bytes as u64, self.overflow.bytes]
     }
 
     /// Bytes of the decoded images that are kept.
@@ -101,11 +197,16 @@ impl ImageStore {
     }
 }
 
-impl Packed {
-    fn open(&self) -> std::io::Result<Heightmap> {
-        let mut heightmap = Heightmap::new(self.workspace);
+impl ImageStore {
+    fn open(&self, id: ImageId) -> std::io::Result<Heightmap> {
+        let Packed { workspace, place } = &self.packed[id];
+        let bytes = match place {
+            Place::Memory(bytes) => Cow::Borrowed(&**bytes),
+            Place::File { offset, len } => Cow::Owned(self.overflow.read(*offset, *len)?),
+        };
+        let mut heightmap = Heightmap::new(*workspace);
         let cells = heightmap.height_m.len();
-        let bytes = zstd::bulk::decompress(&self.bytes, bytes_of(&heightmap))?;
+        let bytes = zstd::bulk::decompress(&bytes, bytes_of(&heightmap))?;
         let (rgb, heights) = bytes.split_at(3 * cells);
         heightmap.rgb.copy_from_slice(rgb);
         for (index, height) in heightmap.height_m.iter_mut().enumerate() {
@@ -136,18 +237,40 @@ mod tests {
     }
 
     #[test]
-    fn images_come_back_bit_for_bit_within_the_bound() {
+    fn images_come_back_bit_for_bit_within_the_bounds() {
         const BYTES: usize = 16 * 8 * 7;
-        for (bound_bytes, kept) in [(usize::MAX, 5), (2 * BYTES + 1, 2), (0, 0)] {
-            let mut store = ImageStore::new(bound_bytes);
-            for mark in 0..5 {
-                assert_eq!(store.add(&image(mark)).unwrap(), mark);
+        let folder = tempfile::tempdir().unwrap();
+        let all = {
+            let mut store = ImageStore::with_bounds(0, usize::MAX, folder.path());
+            (0..5).for_each(|mark| assert_eq!(store.add(&image(mark)).unwrap(), mark));
+            store.compressed_bytes()[0]
+        };
+        for (decoded_bound, kept) in [(usize::MAX, 5), (2 * BYTES + 1, 2), (0, 0)] {
+            for compressed_bound in [usize::MAX, all as usize / 2, 0] {
+                let mut store =
+                    ImageStore::with_bounds(decoded_bound, compressed_bound, folder.path());
+                for mark in 0..5 {
+                    assert_eq!(store.add(&image(mark)).unwrap(), mark);
+                }
+                for mark in [0, 4, 0, 1, 2, 3, 0] {
+                    assert_eq!(*store.get(mark).unwrap(), image(mark));
+                    assert!(store.decoded_bytes() <= decoded_bound);
+                }
+                assert_eq!(store.decoded_bytes(), kept * BYTES);
+                let [memory, file] = store.compressed_bytes();
+                assert!(memory <= compressed_bound as u64);
+                assert_eq!(memory + file, all);
+                assert_eq!(file == 0, compressed_bound == usize::MAX);
+                // The file has no name.
+                assert_eq!(folder.path().read_dir().unwrap().count(), 0);
             }
-            for mark in [0, 4, 0, 1, 2, 3, 0] {
-                assert_eq!(*store.get(mark).unwrap(), image(mark));
-                assert!(store.decoded_bytes() <= bound_bytes);
-            }
-            assert_eq!(store.decoded_bytes(), kept * BYTES);
         }
+    }
+
+    #[test]
+    fn a_folder_that_holds_no_file_is_an_error() {
+        let file = tempfile::NamedTempFile::new().unwrap();
+        let mut store = ImageStore::with_bounds(0, 0, &file.path().join("folder"));
+        assert!(store.add(&image(1)).is_err());
     }
 }

@@ -13,6 +13,7 @@ mod reliability;
 mod rollout;
 mod sampling;
 mod search;
+mod shown;
 mod sweep;
 mod table;
 mod tensorboard;
@@ -30,6 +31,7 @@ pub use evaluation::{
     evaluate,
 };
 pub use goal::{goal, known_images, reached};
+pub use images::ImageMemory;
 pub use interval::{bootstrap_95, wilson_95};
 pub use recipe::{Demonstrations, Recipe, RecipeError, Validation};
 pub use reliability::{Reliability, ReliabilityBin, Unasked, reliability};
@@ -38,6 +40,7 @@ pub use rollout::{
 };
 pub use sampling::{ModuleWeights, Sampling, SamplingError, StepWeights};
 pub use search::{Search, SearchError, Trial, TrialSnapshot};
+pub use shown::{ShownError, ShownFolder};
 pub use sweep::{Run, RunResult, Score, SnapshotResult, Sweep, Test};
 pub use table::{Cell, Rate, Table};
 pub use tensorboard::EventFile;

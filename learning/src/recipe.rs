@@ -1,6 +1,7 @@
 //! Training recipes: everything that makes a policy, in one YAML file.
 
 use crate::data_set::Shown;
+use crate::images::ImageMemory;
 use crate::sampling::{Sampling, SamplingError};
 use gctn::{GoalConditioning, Network, NetworkConfig, TrainingConfig};
 use serde::{Deserialize, Serialize};
@@ -35,9 +36,13 @@ pub struct Recipe {
     /// What is shown to a network of the conditioning `sequence`.
     #[serde(default, skip_serializing_if = "is_default")]
     pub shown: Shown,
-    /// Most MB of images that are kept decoded; all of them are kept compressed. Changes no result.
-    #[serde(default = "decoded_mb", skip_serializing_if = "is_usual")]
+    /// Most MB of images that are kept decoded. Changes no result.
+    #[serde(default = "decoded_mb", skip_serializing_if = "is_decoded_mb")]
     pub decoded_mb: usize,
+    /// Most MB of compressed images that are kept in memory; the others lie in a file in the training's folder that disappears
+    /// with the process. Changes no result.
+    #[serde(default = "compressed_mb", skip_serializing_if = "is_compressed_mb")]
+    pub compressed_mb: usize,
     /// Number of snapshots, evenly spread over the training.
     pub snapshots: u64,
     /// The policy is the mean of the weights of the last so many snapshots; 1: a single one, the best in validation. For a training
@@ -85,11 +90,19 @@ fn is_default(shown: &Shown) -> bool {
 }
 
 fn decoded_mb() -> usize {
-    512
+    ImageMemory::default().decoded_mb
 }
 
-fn is_usual(mb: &usize) -> bool {
+fn is_decoded_mb(mb: &usize) -> bool {
     *mb == decoded_mb()
+}
+
+fn compressed_mb() -> usize {
+    ImageMemory::default().compressed_mb
+}
+
+fn is_compressed_mb(mb: &usize) -> bool {
+    *mb == compressed_mb()
 }
 
 /// Validation episodes, on seeds that neither training nor test uses.

@@ -2,6 +2,7 @@
 
 use crate::agent::Agent;
 use crate::data_set::Shown;
+use crate::images::ImageMemory;
 use crate::recipe::{Demonstrations, Recipe, RecipeError, Validation, check_field, read_yaml};
 use gctn::{NetworkConfig, TrainingConfig};
 use serde::{Deserialize, Serialize};
@@ -225,7 +226,8 @@ impl Sweep {
             sampling: run.agent.sampling(),
             goal_jitter: self.goal_jitter,
             shown: Shown::default(),
-            decoded_mb: 512,
+            decoded_mb: ImageMemory::default().decoded_mb,
+            compressed_mb: ImageMemory::default().compressed_mb,
             snapshots: self.snapshots,
             average: 1,
             validation: self.validation.clone(),

@@ -2,10 +2,13 @@
 
 use crate::data_set::{DataSet, DataSetError, DrawRules, DrawnSample};
 use crate::recipe::Recipe;
-use gctn::{Losses, ModelCard, Storage, Trainer};
+use gctn::{Batch, BatchMaker, Losses, ModelCard, Storage, Trainer};
 use rand::SeedableRng;
 use rand_chacha::ChaCha8Rng;
 use std::path::{Path, PathBuf};
+use std::sync::Arc;
+use std::sync::mpsc::{Receiver, sync_channel};
+use std::thread::JoinHandle;
 
 /// Stream of the seed's random numbers that samples are drawn from; step `n` draws from this one plus
 /// `n`, so that a resumed training draws what an uninterrupted one would have.
@@ -15,10 +18,92 @@ const SAMPLING_STREAM: u64 = 1 << 40;
 /// `policy.safetensors`.
 #[derive(Debug)]
 pub struct Training {
-    recipe: Recipe,
-    data: DataSet,
+    sampler: Arc<Sampler>,
     directory: PathBuf,
     trainer: Trainer,
+    /// Begun by the first step, and again after a failed one.
+    prefetch: Option<Prefetch>,
+}
+
+/// Draws the samples of each gradient step.
+#[derive(Debug)]
+struct Sampler {
+    recipe: Recipe,
+    data: DataSet,
+    maker: BatchMaker,
+}
+
+impl Sampler {
+    /// The batch of the gradient step after `step` others.
+    fn batch(&self, step: u64) -> Result<Batch, TrainingError> {
+        let Recipe {
+            training,
+            network,
+            sampling,
+            goal_jitter,
+            shown,
+            ..
+        } = &self.recipe;
+        let mut rng = ChaCha8Rng::seed_from_u64(training.seed);
+        rng.set_stream(SAMPLING_STREAM + step);
+        let rules = DrawRules {
+            sampling,
+            conditioning: network.conditioning,
+            goal_jitter: *goal_jitter,
+            shown: *shown,
+        };
+        let drawn = (0..training.batch).map(|_| self.data.draw(&rules, &mut rng));
+        let drawn = drawn.collect::<Result<Vec<_>, _>>()?;
+        let samples: Vec<_> = drawn.iter().map(DrawnSample::sample).collect();
+        Ok(self.maker.batch(step, &samples)?)
+    }
+}
+
+/// A thread that makes the batches of the next gradient steps while the present one is computed.
+#[derive(Debug)]
+struct Prefetch {
+    /// `None` only while the thread is waited for.
+    batches: Option<Receiver<Result<Batch, TrainingError>>>,
+    thread: Option<JoinHandle<()>>,
+}
+
+impl Prefetch {
+    /// Batches that wait, besides the one being made.
+    const WAITING: usize = 1;
+
+    /// Batches from this step on, in order.
+    fn start(sampler: Arc<Sampler>, first: u64) -> Self {
+        let (sender, batches) = sync_channel(Self::WAITING);
+        let make = move || {
+            let mut steps = first..;
+            // Ends where nobody receives any more.
+            while steps
+                .next()
+                .is_some_and(|step| sender.send(sampler.batch(step)).is_ok())
+            {}
+        };
+        Self {
+            batches: Some(batches),
+            thread: Some(std::thread::spawn(make)),
+        }
+    }
+
+    /// The next batch.
+    fn next(&self) -> Result<Batch, TrainingError> {
+        let batch = self
+            .batches
+            .as_ref()
+            .and_then(|batches| batches.recv().ok());
+        batch.unwrap_or(Err(TrainingError::Prefetch))
+    }
+}
+
+impl Drop for Prefetch {
+    fn drop(&mut self) {
+        self.batches = None;
+        // A panic of the thread has been printed, and `next` has failed.
+        let _ = self.thread.take().map(JoinHandle::join);
+    }
 }
 
 /// Why a training cannot begin or go on.
@@ -44,6 +129,9 @@ pub enum TrainingError {
     /// The demonstrations.
     #[error(transparent)]
     Data(#[from] DataSetError),
+    /// The thread that draws samples panicked.
+    #[error("the thread that draws samples has stopped")]
+    Prefetch,
 }
 
 impl Training {
@@ -74,16 +162,20 @@ impl Training {
             source,
         })?;
         Ok(Self {
-            recipe,
-            data,
+            sampler: Arc::new(Sampler {
+                maker: trainer.batch_maker(),
+                recipe,
+                data,
+            }),
             directory: directory.to_owned(),
             trainer,
+            prefetch: None,
         })
     }
 
     /// The recipe.
     pub fn recipe(&self) -> &Recipe {
-        &self.recipe
+        &self.sampler.recipe
     }
 
     /// Gradient steps done.
@@ -98,36 +190,24 @@ impl Training {
 
     /// Whether all gradient steps are done.
     pub fn is_done(&self) -> bool {
-        self.step() >= self.recipe.training.steps
+        self.step() >= self.recipe().training.steps
     }
 
-    /// One gradient step.
+    /// One gradient step. The samples of the next ones are drawn, decoded and augmented meanwhile, on a thread.
     pub fn advance(&mut self) -> Result<Losses, TrainingError> {
-        let Recipe {
-            training,
-            network,
-            sampling,
-            goal_jitter,
-            shown,
-            ..
-        } = &self.recipe;
-        let mut rng = ChaCha8Rng::seed_from_u64(training.seed);
-        rng.set_stream(SAMPLING_STREAM + self.trainer.step());
-        let rules = DrawRules {
-            sampling,
-            conditioning: network.conditioning,
-            goal_jitter: *goal_jitter,
-            shown: *shown,
-        };
-        let drawn = (0..training.batch).map(|_| self.data.draw(&rules, &mut rng));
-        let drawn = drawn.collect::<Result<Vec<_>, _>>()?;
-        let samples: Vec<_> = drawn.iter().map(DrawnSample::sample).collect();
-        Ok(self.trainer.train_step(&samples)?)
+        let start = || Prefetch::start(Arc::clone(&self.sampler), self.trainer.step());
+        // Not kept after a failed step: the batch that waits is of the step after it.
+        let prefetch = self.prefetch.take().unwrap_or_else(start);
+        let losses = self.trainer.train_batch(prefetch.next()?)?;
+        self.prefetch = Some(prefetch);
+        Ok(losses)
     }
 
     /// Whether the present step is one after which a snapshot is taken.
     pub fn is_snapshot_due(&self) -> bool {
-        self.recipe.snapshot_steps().any(|step| step == self.step())
+        self.recipe()
+            .snapshot_steps()
+            .any(|step| step == self.step())
     }
 
     /// Writes a snapshot and the state to go on from; gives the snapshot's path.
@@ -180,6 +260,7 @@ mod tests {
             goal_jitter: 0.3,
             shown: Shown::default(),
             decoded_mb: 1,
+            compressed_mb: 0,
             snapshots: 3,
             average: 1,
             validation: Validation {

@@ -1,7 +1,7 @@
 //! Rotated query windows, and their correlation with key features.
 
 use nalgebra::{Point2, Rotation2, Vector2};
-use tch::{Kind, Tensor};
+use tch::{Device, Kind, Tensor};
 
 use crate::Interpolation;
 use crate::input::rotation_angle;
@@ -100,30 +100,92 @@ fn correlate_in_frequencies(key: &Tensor, windows: &Tensor, grid: &Grid) -> Tens
         .narrow(3, 0, grid.cols as i64)
 }
 
-/// By FFT over columns and, at each of their frequencies, one product of matrices over channels and rows.
+/// By Fourier transform of the columns and, at each of their frequencies, products of matrices over channels and rows. The
+/// transforms are products of matrices too: of so short rows these are faster than a FFT, and nothing is copied between layouts.
 fn correlate_in_column_frequencies(key: &Tensor, windows: &Tensor, grid: &Grid) -> Tensor {
     let size = windows.size();
     let [samples, turns, channels, window] = [size[0], size[1], size[2], size[3]];
     let (rows, cols) = (grid.rows as i64, grid.cols as i64);
-    let fft_size = fast_size(key.size()[3]);
-    let frequencies = fft_size / 2 + 1;
-    let shifted = key
-        .fft_rfft(fft_size, -1, "backward")
-        .unfold(2, rows, 1)
-        .narrow(2, 0, window)
-        .permute([0, 3, 1, 2, 4])
-        .reshape([samples * frequencies, channels * window, rows]);
-    let windows = windows
-        .fft_rfft(fft_size, -1, "backward")
-        .conj()
-        .permute([0, 4, 1, 2, 3])
-        .reshape([samples * frequencies, turns, channels * window]);
-    windows
-        .bmm(&shifted)
-        .view([samples, frequencies, turns, rows])
-        .permute([0, 2, 3, 1])
-        .fft_irfft(fft_size, -1, "backward")
-        .narrow(3, 0, cols)
+    let (key_rows, key_cols) = (key.size()[2], key.size()[3]);
+    let spectrum = Spectrum::new(key_cols, (key.kind(), key.device()));
+    let frequencies = spectrum.frequencies;
+
+    // Real and imaginary parts, samples * frequencies x channels * window x rows.
+    let keys = spectrum
+        .of(&key.reshape([samples, channels * key_rows, key_cols]))
+        .view([samples * frequencies, 2, channels, key_rows])
+        .unfold(3, rows, 1)
+        .narrow(3, 0, window)
+        .reshape([samples * frequencies, 2, channels * window, rows]);
+    let [key_real, key_imaginary] = [0, 1].map(|part| keys.select(1, part));
+    // The same of the windows, samples * frequencies x turns x channels * window.
+    let windows = spectrum
+        .of(&windows.reshape([samples, turns * channels * window, window]))
+        .view([samples * frequencies, 2, turns, channels * window]);
+    let [real, imaginary] = [0, 1].map(|part| windows.select(1, part));
+
+    let product = [
+        real.bmm(&key_real) + imaginary.bmm(&key_imaginary),
+        real.bmm(&key_imaginary) - imaginary.bmm(&key_real),
+    ];
+    let product = Tensor::stack(&product, 1).view([samples, 2 * frequencies, turns * rows]);
+    spectrum
+        .back(&product, cols)
+        .view([samples, turns, rows, cols])
+}
+
+/// The discrete Fourier transform of real numbers as matrices.
+struct Spectrum {
+    /// Numbers, the circle on which a correlation wraps.
+    len: i64,
+    frequencies: i64,
+    options: (Kind, Device),
+}
+
+impl Spectrum {
+    fn new(len: i64, options: (Kind, Device)) -> Self {
+        Self {
+            len,
+            frequencies: len / 2 + 1,
+            options,
+        }
+    }
+
+    /// A matrix, 2 * frequencies (cosine and sine of each) x numbers, of the first numbers; each row times its factor.
+    fn matrix(&self, numbers: i64, factor: impl Fn(i64) -> [f64; 2]) -> Tensor {
+        let mut matrix = Vec::with_capacity((2 * self.frequencies * numbers) as usize);
+        for frequency in 0..self.frequencies {
+            let angle = |at: i64| {
+                let turn = (frequency * at % self.len) as f64 / self.len as f64;
+                std::f64::consts::TAU * turn
+            };
+            let [cosine, sine] = factor(frequency);
+            matrix.extend((0..numbers).map(|at| cosine * angle(at).cos()));
+            matrix.extend((0..numbers).map(|at| sine * angle(at).sin()));
+        }
+        Tensor::from_slice(&matrix)
+            .view([2 * self.frequencies, numbers])
+            .to_kind(self.options.0)
+            .to_device(self.options.1)
+    }
+
+    /// Real and imaginary parts of the spectra of N x rows x numbers, padded with 0: N x 2 * frequencies x rows.
+    fn of(&self, numbers: &Tensor) -> Tensor {
+        let matrix = self.matrix(numbers.size()[2], |_| [1.0, -1.0]);
+        matrix.matmul(&numbers.transpose(1, 2))
+    }
+
+    /// The first numbers of spectra N x 2 * frequencies x rows: N x rows x numbers.
+    fn back(&self, spectra: &Tensor, numbers: i64) -> Tensor {
+        let factor = |frequency: i64| {
+            // Every frequency but the lowest and, of an even length, the highest stands for its mirror image too.
+            let alone = frequency == 0 || 2 * frequency == self.len;
+            let share = if alone { 1.0 } else { 2.0 } / self.len as f64;
+            [share, -share]
+        };
+        let matrix = self.matrix(numbers, factor);
+        spectra.transpose(1, 2).matmul(&matrix)
+    }
 }
 
 /// The smallest size from `least` up that is even and has no prime factor above 5.
@@ -144,7 +206,6 @@ fn fast_size(least: i64) -> i64 {
 mod tests {
     use super::*;
     use std::f64::consts::TAU;
-    use tch::Device;
 
     const DOUBLE: (Kind, Device) = (Kind::Double, Device::Cpu);
 

@@ -75,6 +75,16 @@ pub enum Error {
         /// Samples configured.
         expected: usize,
     },
+    /// A batch that was made for another gradient step.
+    #[error(
+        "a batch of the gradient step after {actual} others, expected the one after {expected}"
+    )]
+    BatchStep {
+        /// Steps before the one that it was made for.
+        actual: u64,
+        /// Steps done.
+        expected: u64,
+    },
     /// A demonstration with too few images to tell one from the other.
     #[error("demonstration {index} has {actual} images, expected at least 2")]
     Sequence {

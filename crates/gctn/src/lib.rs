@@ -4,6 +4,7 @@
 //! become, into a pick and a place pose in SE(2); a [`Trainer`] makes one from demonstrated steps.
 
 mod augment;
+mod batch;
 mod calibration;
 mod checkpoint;
 mod config;
@@ -19,6 +20,7 @@ mod policy;
 mod sample;
 mod trainer;
 
+pub use batch::{Batch, BatchMaker};
 pub use calibration::{Calibration, Evidence, Verdict};
 pub use checkpoint::{ModelCard, Storage, average, calibrate};
 pub use config::{

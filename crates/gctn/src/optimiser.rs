@@ -11,6 +11,8 @@ const EPSILON: f64 = 1e-8;
 #[derive(Debug)]
 pub(crate) struct AdamW {
     moments: [Tensor; 2],
+    /// Room for the divisor of a step.
+    divisor: Tensor,
 }
 
 /// How large a step is.
@@ -26,6 +28,7 @@ impl AdamW {
     pub fn new(weights: &Tensor) -> Self {
         Self {
             moments: [(); 2].map(|()| weights.zeros_like()),
+            divisor: weights.zeros_like(),
         }
     }
 
@@ -44,14 +47,21 @@ impl AdamW {
                 gradient *= clip / norm;
             }
             let [mean, square] = &mut self.moments;
-            *mean *= BETAS[0];
-            *mean += &gradient * (1.0 - BETAS[0]);
-            *square *= BETAS[1];
-            *square += gradient.square_() * (1.0 - BETAS[1]);
+            // Each line is one pass over the weights, none makes a new tensor.
+            let _ = mean.lerp_(&gradient, 1.0 - BETAS[0]);
+            let _ = square.lerp_(&gradient.square_(), 1.0 - BETAS[1]);
+            // w -= r (m / a) / (sqrt(s / b) + e) is w += m / (f (sqrt(s) + e sqrt(b))) with f = -a / (r sqrt(b)).
             let [mean_bias, square_bias] = BETAS.map(|beta| 1.0 - beta.powi(count));
-            let divisor = (&*square / square_bias).sqrt_() + EPSILON;
-            weights *= 1.0 - rate.learning_rate * rate.weight_decay;
-            weights -= (&*mean / divisor) * (rate.learning_rate / mean_bias);
+            let root = square_bias.sqrt();
+            let factor = -mean_bias / (rate.learning_rate * root);
+            let divisor = &mut self.divisor;
+            let _ = square.sqrt_out(divisor);
+            *divisor += EPSILON * root;
+            *divisor *= factor;
+            if rate.weight_decay > 0.0 {
+                weights *= 1.0 - rate.learning_rate * rate.weight_decay;
+            }
+            let _ = weights.addcdiv_(mean, divisor);
         });
     }
 

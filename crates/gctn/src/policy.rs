@@ -223,14 +223,19 @@ impl Policy {
 
     fn place(&self, logits: &Tensor) -> Result<(Point2<f64>, usize, f64, ScoreMap), Error> {
         let grid = &self.model.grid;
+        // What lies further below the top adds nothing to the sum, and underflows, which would cost most of its time.
+        const DEEPEST: f64 = 40.0;
         let flat = logits.flatten(0, -1);
-        let log_sum = flat.logsumexp([0].as_slice(), false).double_value(&[]);
+        let (top, best) = flat.max_dim(0, false);
+        let (top, best) = (top.double_value(&[]), best.int64_value(&[]) as usize);
         // Not finite where any of them is not, so that only the maps decided on need to be looked at.
-        if !log_sum.is_finite() {
+        let sum = flat.sum(Kind::Float).double_value(&[]);
+        if !(top + sum).is_finite() {
             let what = "the place map";
             return Err(Error::NotFinite { what, step: None });
         }
-        let best = flat.argmax(0, false).int64_value(&[]) as usize;
+        let near = flat.masked_select(&flat.gt(top - DEEPEST));
+        let log_sum = near.logsumexp([0].as_slice(), false).double_value(&[]);
         let cells = grid.rows * grid.cols;
         let (rotation, cell) = (best / cells, best % cells);
         let map = values(&logits.get(rotation as i64), "the place map")?;

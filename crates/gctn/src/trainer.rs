@@ -1,12 +1,12 @@
 //! Training.
 
-use rand_chacha::{ChaCha8Rng, rand_core::SeedableRng};
+use rand_chacha::ChaCha8Rng;
 use std::path::Path;
 use tch::Tensor;
 
-use crate::augment::Warp;
+use crate::batch::{Batch, BatchMaker};
 use crate::checkpoint::{self, File};
-use crate::input::{Label, encode, tensor};
+use crate::input::Label;
 use crate::losses::{done_loss, first_place_loss, pick_loss, place_loss};
 use crate::network::{Builder, Features, Model};
 use crate::optimiser::{self, AdamW, Rate};
@@ -106,19 +106,32 @@ impl Trainer {
         optimiser::learning_rate(learning_rate, schedule, warm_up_steps, steps, self.step)
     }
 
+    /// Makes the batches that [`Trainer::train_batch`] takes.
+    pub fn batch_maker(&self) -> BatchMaker {
+        BatchMaker {
+            network: self.model.config.clone(),
+            training: self.config.clone(),
+            encoding: self.model.encoding(),
+            says_done: self.model.says_done(),
+        }
+    }
+
     /// One gradient step on a batch of the configured size. Fails, leaving the weights as they were, when
     /// loss or gradient is not finite.
     pub fn train_step(&mut self, samples: &[Sample<'_>]) -> Result<Losses, Error> {
-        if samples.len() != self.config.batch {
-            return Err(Error::Batch {
-                actual: samples.len(),
-                expected: self.config.batch,
+        let batch = self.batch_maker().batch(self.step, samples)?;
+        self.train_batch(batch)
+    }
+
+    /// One gradient step on the batch of the present step: as [`Trainer::train_step`] with its samples, bit for bit.
+    pub fn train_batch(&mut self, batch: Batch) -> Result<Losses, Error> {
+        if batch.step != self.step {
+            return Err(Error::BatchStep {
+                actual: batch.step,
+                expected: self.step,
             });
         }
-        // A stream of its own for each step: the random state is the step's number.
-        let mut rng = ChaCha8Rng::seed_from_u64(self.config.seed);
-        rng.set_stream(self.step + 1);
-        let [pick, place, done] = self.forward(samples, &mut rng, true)?;
+        let [pick, place, done] = self.forward(batch)?;
         let sum = &pick + &place + &done;
         let gradients = Tensor::f_run_backward(&[sum], &self.weights, false, false)?;
         let flat: Vec<Tensor> = gradients
@@ -157,14 +170,8 @@ impl Trainer {
 
     /// Losses without augmentation and without learning: for validation. Any number of samples but none.
     pub fn losses(&self, samples: &[Sample<'_>]) -> Result<Losses, Error> {
-        if samples.is_empty() {
-            return Err(Error::Batch {
-                actual: 0,
-                expected: self.config.batch,
-            });
-        }
-        let mut rng = ChaCha8Rng::seed_from_u64(self.config.seed);
-        let [pick, place, done] = tch::no_grad(|| self.forward(samples, &mut rng, false))?;
+        let batch = self.batch_maker().unaugmented(samples)?;
+        let [pick, place, done] = tch::no_grad(|| self.forward(batch))?;
         Ok(Losses {
             pick: pick.double_value(&[]),
             place: place.double_value(&[]),
@@ -173,42 +180,16 @@ impl Trainer {
         })
     }
 
-    fn forward(
-        &self,
-        samples: &[Sample<'_>],
-        rng: &mut ChaCha8Rng,
-        augment: bool,
-    ) -> Result<[Tensor; 3], Error> {
+    fn forward(&self, batch: Batch) -> Result<[Tensor; 3], Error> {
         crate::apply_threads();
         let network = &self.model.config;
-        let encoding = self.model.encoding();
-        let cells = network.rows * network.cols;
-        let mut encoded = vec![0.0; samples.len() * encoding.channels() * cells];
-        let mut labels = Vec::new();
-        let images = encoded.chunks_exact_mut(encoding.channels() * cells);
-        for ((index, sample), image) in samples.iter().enumerate().zip(images) {
-            let label = Label::of(network, index, sample)?;
-            if label.done && !self.model.says_done() {
-                return Err(Error::Done { index });
-            }
-            let warp = if augment {
-                let labels_px = [label.pick_px, label.place_px];
-                Warp::draw(
-                    &self.config.augmentation,
-                    network.rows,
-                    network.cols,
-                    1 + encoding.goals,
-                    labels_px,
-                    rng,
-                )
-            } else {
-                Warp::identity()
-            };
-            encode(encoding, sample.observation, sample.goal, &warp, image);
-            labels.push(label.warped(&warp, network));
-        }
-        let input = tensor(encoding, [network.rows, network.cols], &encoded).to_device(self.device);
-        let features = self.model.forward(&input);
+        let Batch {
+            input,
+            labels,
+            mut rng,
+            ..
+        } = batch;
+        let features = self.model.forward(&input.to_device(self.device));
         let (grid, sigma) = (&self.model.grid, self.config.label_sigma_cells);
         let to_do = |index: &usize| !labels[*index].done;
         let to_do: Vec<usize> = (0..labels.len()).filter(to_do).collect();
@@ -220,7 +201,7 @@ impl Trainer {
             ]
         };
         let [pick, place] = if to_do.len() == labels.len() {
-            of(&features, &labels, rng)
+            of(&features, &labels, &mut rng)
         } else if to_do.is_empty() {
             [features.nothing(), features.nothing()]
         } else {
@@ -228,7 +209,7 @@ impl Trainer {
             let indices: Vec<i64> = to_do.iter().map(|index| *index as i64).collect();
             let chosen: Vec<Label> = to_do.iter().map(|index| labels[*index]).collect();
             let share = to_do.len() as f64 / labels.len() as f64;
-            of(&features.of(&indices), &chosen, rng).map(|loss| loss * share)
+            of(&features.of(&indices), &chosen, &mut rng).map(|loss| loss * share)
         };
         Ok(match &features.first {
             None => [

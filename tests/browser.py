@@ -73,6 +73,14 @@ class Person:
         """Waits until the headline says this."""
         expect(self.page.get_by_role("heading", level=2).first).to_contain_text(text)
 
+    def reads_otherwise(self, text: str) -> None:
+        """Waits until the headline says something else."""
+        expect(self.page.get_by_role("heading", level=2).first).not_to_have_text(text)
+
+    def sees(self, text: str) -> None:
+        """Waits until these words are on the page."""
+        expect(self.page.get_by_text(text)).to_be_visible()
+
     def headline(self) -> str:
         """What the headline says now."""
         return self.page.get_by_role("heading", level=2).first.inner_text()
@@ -94,7 +102,8 @@ class Person:
         """axe-core finds nothing serious: names, roles, contrast, focus."""
         found = Axe().run(self.page).response["violations"]
         serious = [(one["id"], [node["html"] for node in one["nodes"]]) for one in found if one["impact"] in ("serious", "critical")]
-        assert serious == []
+        if serious:
+            raise AssertionError(f"axe-core finds: {serious}")
 
     def close(self) -> None:
         """Leaves; nothing went wrong on the page."""

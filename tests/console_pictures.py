@@ -1,6 +1,6 @@
 """Draws the operator's page for docs/pictures: `.venv/bin/python tests/console_pictures.py docs/pictures`, with the programs built.
 
-A run of stacking at its second step, and a lesson, each 1440 and 390 pixels wide.
+A run of stacking at its second step, a lesson, and a policy that has learned from it, each 1440 and 390 pixels wide.
 """
 
 from __future__ import annotations
@@ -57,6 +57,20 @@ def main() -> None:
             for right, down in ((0.257, 0.31), (0.19, 0.68)):
                 ada.page.mouse.click(board["x"] + right * board["width"], board["y"] + down * board["height"])
             picture(ada.page, folder, "teach")
+            ada.button("Carry it out").click()
+            ada.button("As it should be: keep this step").click()
+            for name in ("red_block", "red_block_again"):
+                ada.page.get_by_label("Name of the task").fill(name)
+                ada.button("Save").click()
+                ada.sees(f"Saved as {name}.")
+            ada.button("End the lesson").click()
+            for name, use in (("red_block", "learn from"), ("red_block_again", "hold out")):
+                ada.page.get_by_role("combobox", name=name, exact=True).select_option(use)
+            ada.page.get_by_label("Name of the policy").fill("taught")
+            ada.page.get_by_role("spinbutton", name="Steps").fill("40")
+            ada.button("Train").click()
+            ada.sees("taught is trained.")
+            picture(ada.page, folder, "train")
         finally:
             launch.end()
 

@@ -21,6 +21,7 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 import pytest
+import teaching
 from browser import Person, address_of, chromium
 from cell_operator import EVENT, Operator, nanoseconds
 from playwright.sync_api import Browser, expect
@@ -30,6 +31,8 @@ from rclpy.parameter import Parameter
 from sctn_msgs.msg import StepConfirmation, StepResult
 
 STEPS = 6
+# A start of the blocks that is another one than that of the lesson.
+START = 10001
 
 
 def console_client() -> Any:
@@ -260,74 +263,53 @@ def test_a_motion_stops_when_the_deciding_page_is_closed_and_the_run_goes_on_whe
     bob.close()
 
 
-def test_a_task_is_taught_by_clicks_saved_and_repeated(browser: Browser, start, operator: Operator, tmp_path: pathlib.Path) -> None:
-    _, address = launch_web(start, 10008, "--library", tmp_path / "library")
-    ada = Person(browser, address, "Ada")
+def test_a_task_that_no_module_programs_is_taught_by_clicks_and_the_shipped_policy_repeats_it_from_another_start(
+    browser: Browser, start, operator: Operator, tmp_path: pathlib.Path
+) -> None:
+    arguments = ["--problem", REPOSITORY / teaching.SCENE, "--seed", 10000, "--checkpoint", teaching.CHECKPOINT]
+    launch = start("sctn", "launch", *arguments, "--operator", "web", "--library", tmp_path / "library")
+    ada = Person(browser, address_of(launch, until), "Ada")
     ada.takes_control()
-    ada.reads("proposes")
-    # Where the policy would pick there is a block, and where it would place there is room for it.
-    proposed = operator.next("pick_place")
+    operator.next("heightmap")
     ada.button("Teach a new task").click()
     ada.reads("Teaching a new task")
     ada.finds_no_barrier()
-
-    def click(x_m: float, y_m: float) -> None:
-        table = ada.page.get_by_role("img", name="The table now, from above")
-        table.scroll_into_view_if_needed()
-        box = table.bounding_box()
-        # The robot looks up: x up, y to the left.
-        ada.page.mouse.click(box["x"] + (0.5 - y_m) * box["width"], box["y"] + (0.75 - x_m) / 0.5 * box["height"])
-
-    click(proposed.pick.x, proposed.pick.y)
-    expect(ada.page.get_by_text("Now click where to place it.")).to_be_visible()
-    click(proposed.place.x, proposed.place.y)
-    results = operator.count("step_result")
-    ada.button("Carry it out").click()
-    moved = operator.next("step_result", results)
-    assert moved.outcome == StepResult.PLACED, moved
-    ada.button("As it should be: keep this step").click()
-    expect(ada.page.get_by_text("Lesson, 1 step so far.")).to_be_visible()
-
+    teaching.show(ada, operator, 0)
     # The step is taken back, and shown once more.
+    results = operator.count("step_result")
     ada.button("Take the last step back").click()
+    teaching.seen_since(operator, operator.next("step_result", results).header.stamp)
     ada.button("As it should be: keep this step").click()
-    expect(ada.page.get_by_text("Lesson, 0 steps so far.")).to_be_visible()
-    click(proposed.pick.x, proposed.pick.y)
-    click(proposed.place.x, proposed.place.y)
-    ada.button("Carry it out").click()
-    ada.button("As it should be: keep this step").click()
-    ada.page.get_by_label("Name of the task").fill("one_block")
-    ada.button("Save").click()
-    expect(ada.page.get_by_text("Saved as one_block.")).to_be_visible()
-    ada.page.get_by_label("Name of the task").fill("held_back")
-    ada.button("Save").click()
-    expect(ada.page.get_by_text("Saved as held_back.")).to_be_visible()
+    for shown in range(len(teaching.TASK)):
+        teaching.show(ada, operator, shown)
+    ada.sees("Lesson, 3 steps so far.")
+    teaching.save(ada, teaching.NAME)
+    teaching.save(ada, "held_back")
     ada.button("End the lesson").click()
 
-    goals = operator.count("goal")
-    ada.button("Repeat one_block").click()
-    goal = operator.next("goal", goals)
-    assert (goal.problem, goal.step, goal.step_count) == ("one_block", 1, 1)
-    ada.reads("Step 1 of 1")
+    teaching.reset(operator, START)
+    went = teaching.repeat(ada, operator)
+    assert went.done, went
+    assert operator.newest("pick_place").checkpoint == "any_start"
+    goal = operator.next("goal", accept=lambda goal: goal.complete)
+    assert (goal.problem, goal.step_count) == (teaching.NAME, 3)
 
     # A policy learns from the one task, is compared on the other, and is used while the graph is at work.
-    ada.page.get_by_role("combobox", name="one_block").select_option("learn from")
+    ada.page.get_by_role("combobox", name=teaching.NAME).select_option("learn from")
     ada.page.get_by_role("combobox", name="held_back").select_option("hold out")
     ada.page.get_by_label("Name of the policy").fill("taught")
     ada.page.get_by_role("spinbutton", name="Steps").fill("2")
     ada.button("Train").click()
     expect(ada.page.get_by_text("taught is trained.")).to_be_visible()
-    compared = ada.page.get_by_role("table", name="Median distance from 1 held-out step")
+    compared = ada.page.get_by_role("table", name="Median distance from 3 held-out steps")
     expect(compared.get_by_role("row", name=re.compile(r"taught [0-9.]+ mm [0-9.]+ mm [0-9.]+°"))).to_be_visible()
     ada.finds_no_barrier()
     ada.page.get_by_role("combobox", name="Checkpoint").select_option("taught")
     ada.button("Use this checkpoint").click()
-    expect(ada.button("Go back to ten_problems")).to_be_visible()
-    ada.can("Reject")
-    operator.spin(0.5)
+    expect(ada.button("Go back to any_start")).to_be_visible()
     proposals = operator.count("pick_place")
-    ada.button("Reject").click()
-    assert operator.next("pick_place", proposals).checkpoint == "taught"
+    ada.button(f"Repeat {teaching.NAME}").click()
+    operator.next("pick_place", proposals, lambda proposal: proposal.checkpoint == "taught")
     ada.close()
 
 
@@ -341,9 +323,8 @@ def test_a_program_approves_a_step_and_is_refused_what_is_stale(start, decided) 
     rows, cols, colors, heights_m = console.heightmap("present")
     assert (rows, cols, len(colors), len(heights_m)) == (320, 160, 3 * 320 * 160, 320 * 160)
     assert 0.01 < max(heights_m) < 0.3
-    until(lambda: "approve" not in console.state()["refused"], "fresh streams", 30.0)
-    # The executor plans after the policy has proposed.
-    until(lambda: (console.state()["motion"] or {}).get("duration_s"), "planned motion", 30.0)
+    # The executor has planned it by then.
+    until(lambda: "approve" not in console.state()["refused"], "proposal that can be approved", 30.0)
     first = console.state()
     assert (first["proposal"]["author"], first["proposal"]["checkpoint"]) == ("gctn_policy", "ten_problems")
     motion = json.loads(console._request("motion")[0])

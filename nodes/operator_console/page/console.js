@@ -30,7 +30,8 @@ let state = null;
 let link = "lost";
 /** Pictures by which they are: present, goal, goal-2, before-1. */
 const pictures = new Map();
-const loading = new Set();
+/** What is being loaded, by what it is. */
+const loading = new Map();
 /** What the operator was told about the last click. */
 let answer = "";
 let busy = false;
@@ -62,9 +63,13 @@ function need(which, number, load = () => api.heightmap(which)) {
   const picture = pictures.get(which);
   if (picture?.number === number) return picture;
   if (!loading.has(which)) {
-    loading.add(which);
-    load()
-      .then((loaded) => pictures.set(which, loaded))
+    // What a past step has led to is often what the table looks like now: it is not loaded twice.
+    const isPresent = /^(before|after)-/.test(which) && state.heightmap?.number === number;
+    const [source, loaded] = isPresent ? [loading.get("present"), pictures.get("present")] : [];
+    const asked = loaded?.number === number ? Promise.resolve(loaded) : source ?? load();
+    loading.set(which, asked);
+    asked
+      .then((found) => pictures.set(which, found))
       .catch(() => {})
       .finally(() => { loading.delete(which); render(); });
   }
@@ -89,6 +94,9 @@ function obstacle(action) {
   if (action === "continue") return state.phase === "stopped" ? undefined : "The run is not stopped.";
   const refused = state.refused[action];
   if (refused) return `${refused.reason} ${refused.advice}`;
+  // An executor that has not planned the proposal does not know it: an approval would be lost.
+  if (action === "approve" && !state.motion) return "The executor has not planned the motion yet. Wait a moment; if it stays so, look whether suction_executor is active.";
+  if (action === "approve" && state.motion.reason) return `The motion cannot be planned: ${state.motion.reason}. Reject it, or correct pick and place.`;
   if (action === "approve" && pictures.get("present")?.number !== state.heightmap?.number) return "The newest picture is on its way.";
   return undefined;
 }
@@ -102,12 +110,14 @@ async function act(action) {
   if (action === "correct") return correction ? endCorrection() : beginCorrection();
   busy = true;
   answer = "";
+  // It is on its way before the page shows that it is.
+  const asked = action === "home" ? api.post("home")
+    : action === "teach" ? api.post("lesson/begin")
+    : action === "continue" ? api.post("step", { step: state.goal.step })
+    : api.post("decisions", { proposal_id: state.proposal?.id ?? "0", decision: action });
   renderButtons();
   try {
-    if (action === "home") await api.post("home");
-    else if (action === "teach") await api.post("lesson/begin");
-    else if (action === "continue") await api.post("step", { step: state.goal.step });
-    else await api.post("decisions", { proposal_id: state.proposal?.id ?? "0", decision: action });
+    await asked;
   } catch (error) {
     answer = error.message;
   }
@@ -434,13 +444,17 @@ function renderPictures() {
   const scored = mode.endsWith("_scores");
   const scores = scored && state.scores ? need("scores", state.scores, () => api.scores()) : null;
   if (scored && !state.scores) setText($("legend"), "There are no scores of the present proposal.");
-  const drawn = `${mode} ${present?.number} ${goal?.number} ${scores?.number}`;
+  const drawn = `${mode} ${present?.number} ${mode === "difference" ? goal?.number : ""} ${scores?.number}`;
   if ($("boards").dataset.drawn !== drawn) {
     $("boards").dataset.drawn = drawn;
     const shown = scores?.[mode] ?? present;
     const share = shown ? draw(boards.now.canvas, shown, scored ? "color" : mode, goal) : 0;
-    if (goal) draw(boards.goal.canvas, goal, mode === "difference" || scored ? "color" : mode);
     setText($("now-note"), mode === "difference" && present && goal ? `(${(100 * share).toFixed(1)} % of it differs from the goal)` : "");
+  }
+  const goalDrawn = `${mode} ${goal?.number}`;
+  if (goal && boards.goal.canvas.dataset.drawn !== goalDrawn) {
+    boards.goal.canvas.dataset.drawn = goalDrawn;
+    draw(boards.goal.canvas, goal, mode === "difference" || scored ? "color" : mode);
   }
   setText($("goal-note"), state.goal ? `(step ${state.goal.step} of ${state.goal.step_count}, ${state.goal.module})` : "");
   if (correction && !state.lesson && !["proposed", "awaiting_proposal"].includes(state.phase)) return endCorrection();
@@ -613,15 +627,31 @@ function renderMessages() {
   });
 }
 
+let restAsked = false;
+
+/** What a decision needs is shown at once; the rest after the browser has painted it. */
 function render() {
   if (!state) return;
+  renderDecision();
+  if (restAsked) return;
+  restAsked = true;
+  requestAnimationFrame(() => setTimeout(() => {
+    restAsked = false;
+    renderRest();
+  }));
+}
+
+function renderDecision() {
   setText($("headline"), state.lesson ? "Teaching a new task" : state.headline);
   setText($("advice"), state.lesson ? "Show one pick and place after the other. The robot repeats them later, from where the objects lie then." : state.advice);
   renderRole();
   renderLesson();
   renderPictures();
-  renderMotion();
   renderButtons();
+}
+
+function renderRest() {
+  renderMotion();
   renderStrip();
   renderMessages();
   renderPolicy();

@@ -29,19 +29,24 @@ export function toWorld(map, u, v) {
   return [map.origin_x_m + (map.cols - v) * map.pixel_size_m, map.origin_y_m + (map.rows - u) * map.pixel_size_m];
 }
 
-function ramp(share) {
-  const at = Math.min(Math.max(share, 0), 0.9999) * (RAMP.length - 1);
+/** A colour as a pixel of an image, opaque. */
+const pixelOf = (r, g, b) => ((255 << 24) | (b << 16) | (g << 8) | r) >>> 0;
+
+/** Pixels from the lowest to the highest. */
+const RAMP_PIXELS = Uint32Array.from({ length: 256 }, (_, index) => {
+  const at = Math.min(index / 255, 0.9999) * (RAMP.length - 1);
   const [low, high] = [RAMP[Math.floor(at)], RAMP[Math.floor(at) + 1]];
-  return low.map((value, index) => value + (high[index] - value) * (at % 1));
-}
+  return pixelOf(...low.map((value, part) => Math.round(value + (high[part] - value) * (at % 1))));
+});
+const [TO_COME, TO_GO, RECOLOURED] = [pixelOf(255, 160, 40), pixelOf(90, 160, 255), pixelOf(224, 110, 224)];
 
 /** Draws a heightmap; `other` is what it is compared with. Returns the share of cells that differ, in mode difference. */
 export function draw(canvas, picture, mode, other) {
   const { rows, cols, rgb, height_m } = picture;
-  canvas.width = rows;
-  canvas.height = cols;
+  if (canvas.width !== rows || canvas.height !== cols) Object.assign(canvas, { width: rows, height: cols });
   const context = canvas.getContext("2d");
   const image = context.createImageData(rows, cols);
+  const pixels = new Uint32Array(image.data.buffer);
   let highest = 0.02;
   if (mode === "height") for (const height of height_m) highest = Math.max(highest, height);
   const comparable = mode === "difference" && other?.rows === rows && other.cols === cols;
@@ -49,22 +54,20 @@ export function draw(canvas, picture, mode, other) {
   for (let row = 0; row < rows; row++) {
     for (let col = 0; col < cols; col++) {
       const cell = row * cols + col;
-      const pixel = 4 * ((cols - 1 - col) * rows + rows - 1 - row);
-      let color = [rgb[3 * cell], rgb[3 * cell + 1], rgb[3 * cell + 2]];
+      const r = rgb[3 * cell], g = rgb[3 * cell + 1], b = rgb[3 * cell + 2];
+      let pixel;
       if (mode === "height") {
-        color = ramp(height_m[cell] / highest);
+        pixel = RAMP_PIXELS[Math.round((255 * Math.min(Math.max(height_m[cell], 0), highest)) / highest)];
       } else if (comparable) {
         const rise = other.height_m[cell] - height_m[cell];
-        let change = 0;
-        for (let part = 0; part < 3; part++) change = Math.max(change, Math.abs(other.rgb[3 * cell + part] - color[part]));
-        const grey = 0.25 * (color[0] + color[1] + color[2]) / 3;
-        if (rise > HEIGHT_DIFFERS_M) color = [255, 160, 40];
-        else if (rise < -HEIGHT_DIFFERS_M) color = [90, 160, 255];
-        else if (change > COLOR_DIFFERS) color = [224, 110, 224];
-        else color = [grey, grey, grey];
-        if (color[0] !== color[1] || color[1] !== color[2]) different++;
+        const change = Math.max(Math.abs(other.rgb[3 * cell] - r), Math.abs(other.rgb[3 * cell + 1] - g), Math.abs(other.rgb[3 * cell + 2] - b));
+        pixel = rise > HEIGHT_DIFFERS_M ? TO_COME : rise < -HEIGHT_DIFFERS_M ? TO_GO : change > COLOR_DIFFERS ? RECOLOURED : 0;
+        if (pixel) different++;
+        else pixel = pixelOf((r + g + b) / 12, (r + g + b) / 12, (r + g + b) / 12);
+      } else {
+        pixel = pixelOf(r, g, b);
       }
-      image.data.set([...color, 255], pixel);
+      pixels[(cols - 1 - col) * rows + rows - 1 - row] = pixel;
     }
   }
   context.putImageData(image, 0, 0);

@@ -1,0 +1,232 @@
+"""Teaches a task by clicks and has it repeated from other starts, in a browser, as a person would.
+
+`.venv/bin/python tests/teaching.py --starts 10`, with the programs built, says how often the shipped policy repeats it.
+
+The task is one that no module programs: three coloured blocks onto three marked places of config/scenes/marked_places.yaml, whose
+own goals are others.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import os
+import pathlib
+import re
+import tempfile
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+os.environ.setdefault("RMW_IMPLEMENTATION", "rmw_fastrtps_cpp")
+
+from browser import Person, address_of, chromium
+from cell_operator import Operator, nanoseconds
+from processes import REPOSITORY, Process, free_domain
+from sctn_msgs.msg import Heightmap, PickPlace, StepResult
+from sctn_msgs.srv import ResetCell
+
+SCENE = "config/scenes/marked_places.yaml"
+NAME = "blocks_on_marks"
+# The shipped policy that follows a demonstration from another start.
+CHECKPOINT = REPOSITORY / "config/checkpoints/any_start.safetensors"
+# Which block is to lie on which mark, in the order in which it is shown: colour, and place in the world frame [m].
+TASK = [("blue", (0.37, 0.2)), ("red", (0.5, 0.2)), ("green", (0.63, 0.2))]
+COLORS = {"red": (255, 87, 89), "green": (89, 161, 79), "blue": (78, 121, 167)}
+# A block of 50 mm lies on its mark of 100 mm where its middle is not further from that of the mark [m].
+NEAR_M = 0.025
+# Proposals for a step that are looked at before a person gives up.
+MOST_PROPOSALS = 5
+
+
+@dataclass
+class Repetition:
+    """How a repetition went."""
+
+    done: bool = False
+    steps: int = 0
+    rejected: int = 0
+    tried_again: int = 0
+
+    @property
+    def needed_nobody(self) -> bool:
+        """Every first proposal was right, and did what it should."""
+        return self.done and self.rejected == self.tried_again == 0
+
+
+def middle(heightmap: Heightmap, color: str) -> tuple[float, float]:
+    """Where a person sees the block of this colour: the middle of its cells, in the world frame [m]."""
+    shape = (heightmap.rows, heightmap.cols)
+    rgb = np.frombuffer(bytes(heightmap.rgb), np.uint8).reshape(*shape, 3).astype(float)
+    height_m = np.array(heightmap.height_m).reshape(shape)
+    # The hue alone: shadows change the rest.
+    hue = rgb / np.linalg.norm(rgb, axis=2, keepdims=True).clip(1.0)
+    names = list(COLORS)
+    wanted = np.array([np.array(COLORS[name]) / np.linalg.norm(COLORS[name]) for name in names])
+    apart = np.linalg.norm(hue[:, :, None] - wanted, axis=3)
+    seen = (height_m > 0.015) & (apart.argmin(axis=2) == names.index(color)) & (apart.min(axis=2) < 0.2)
+    rows, cols = np.nonzero(seen)
+    assert len(rows) > 50, f"the {color} block is not in view"
+    to_m = heightmap.pixel_size_m
+    return float(heightmap.origin.x + to_m * (cols.mean() + 0.5)), float(heightmap.origin.y + to_m * (rows.mean() + 0.5))
+
+
+def seen_since(operator: Operator, stamp: Any) -> Heightmap:
+    """What the table looks like, not before a time."""
+    return operator.next("heightmap", accept=lambda seen: nanoseconds(seen.header.stamp) >= nanoseconds(stamp))
+
+
+def leads_to(proposal: PickPlace, block: tuple[float, float]) -> tuple[float, float]:
+    """Where the middle of a block would come to lie."""
+    turn = proposal.place.theta - proposal.pick.theta
+    x, y = block[0] - proposal.pick.x, block[1] - proposal.pick.y
+    return (
+        proposal.place.x + math.cos(turn) * x - math.sin(turn) * y,
+        proposal.place.y + math.sin(turn) * x + math.cos(turn) * y,
+    )
+
+
+def reset(operator: Operator, seed: int) -> None:
+    """The blocks lie elsewhere, as this seed has them; returns when that is in view."""
+    client = operator.node.create_client(ResetCell, "sim_workcell/reset")
+    operator.until(client.service_is_ready, "sim_workcell", 30.0)
+    answer = client.call_async(ResetCell.Request(request_id=f"start {seed} {operator.count('heightmap')}", seed=seed))
+    operator.until(answer.done, "answer of sim_workcell", 30.0)
+    response = answer.result()
+    assert response.success, response.message
+    seen_since(operator, response.stamp)
+    operator.node.destroy_client(client)
+
+
+def click(person: Person, x_m: float, y_m: float) -> None:
+    """A click on the table at a place of the world frame."""
+    table = person.page.get_by_role("img", name="The table now, from above")
+    table.scroll_into_view_if_needed()
+    box = table.bounding_box()
+    # The robot looks up: x up, y to the left.
+    person.page.mouse.click(box["x"] + (0.5 - y_m) * box["width"], box["y"] + (0.75 - x_m) / 0.5 * box["height"])
+
+
+def show(person: Person, operator: Operator, shown: int) -> None:
+    """Shows a step of the task, counted from 0, by clicks."""
+    color, mark = TASK[shown]
+    person.sees(f"Lesson, {shown} {'step' if shown == 1 else 'steps'} so far. Click what to pick")
+    click(person, *middle(operator.newest("heightmap"), color))
+    person.sees("Now click where to place it.")
+    click(person, *mark)
+    results = operator.count("step_result")
+    person.button("Carry it out").click()
+    after = seen_since(operator, operator.next("step_result", results).header.stamp)
+    assert math.dist(middle(after, color), mark) < NEAR_M
+    person.button("As it should be: keep this step").click()
+
+
+def save(person: Person, name: str) -> None:
+    """Saves the lesson."""
+    person.page.get_by_label("Name of the task").fill(name)
+    person.button("Save").click()
+    person.sees(f"Saved as {name}.")
+
+
+def repeat(person: Person, operator: Operator, name: str = NAME) -> Repetition:
+    """Has the task repeated, approves what leads to it, and says whether each step succeeded."""
+    went = Repetition()
+    goals = operator.count("goal")
+    said = operator.count("pick_place")
+    person.button(f"Repeat {name}").click()
+    operator.next("goal", goals, lambda goal: goal.problem == name)
+    looked_at: set[int] = set()
+    proposals = 0
+
+    def next_proposal() -> PickPlace:
+        """Another proposal than those that were looked at, once the page shows it."""
+        found = operator.next("pick_place", said, lambda proposal: proposal.problem == name and proposal.id not in looked_at)
+        person.sees(f"Pick at x {found.pick.x:.3f} m, y {found.pick.y:.3f} m.")
+        return found
+
+    # Until then the page may say what it said before.
+    proposal = next_proposal()
+    while True:
+        person.reads(re.compile("proposes|succeed|All steps|broke"))
+        headline = person.headline()
+        if "All steps" in headline:
+            went.done = True
+            return went
+        step = int(re.search(r"Step (\d)", headline).group(1))
+        color, mark = TASK[step - 1]
+        if "proposes" in headline:
+            proposal = next_proposal()
+            looked_at.add(proposal.id)
+            proposals += 1
+            block = middle(seen_since(operator, proposal.header.stamp), color)
+            picks = math.dist((proposal.pick.x, proposal.pick.y), block) < 0.03
+            if picks and math.dist(leads_to(proposal, block), mark) < NEAR_M:
+                decision = "Approve"
+            elif proposals >= MOST_PROPOSALS:
+                return went
+            else:
+                decision = "Reject"
+                went.rejected += 1
+        else:
+            result = operator.next(
+                "step_result", accept=lambda result: result.proposal_id == proposal.id and result.outcome != StepResult.REFUSED
+            )
+            after = seen_since(operator, result.header.stamp)
+            if math.dist(middle(after, color), mark) < NEAR_M:
+                decision = "It succeeded: next step"
+                went.steps += 1
+                proposals = 0
+            elif proposals >= MOST_PROPOSALS:
+                return went
+            else:
+                decision = "It failed: try again"
+                went.tried_again += 1
+        person.can(decision)
+        person.button(decision).click()
+        person.reads_otherwise(headline)
+
+
+def main() -> None:
+    """Teaches once, repeats from several starts, prints how it went."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--starts", type=int, default=10, help="from how many starts the task is repeated")
+    parser.add_argument("--first-seed", type=int, default=10001, help="seed of the first start")
+    parser.add_argument("--checkpoint", type=pathlib.Path, default=CHECKPOINT, help="of the policy")
+    asked = parser.parse_args()
+    domain = free_domain()
+    with tempfile.TemporaryDirectory() as scratch, chromium() as browser, Operator(domain) as operator:
+        logs = pathlib.Path(scratch)
+        arguments = ["launch", "--problem", str(REPOSITORY / SCENE), "--seed", "10000", "--operator", "web"]
+        arguments += ["--library", str(logs / "library")]
+        arguments += ["--checkpoint", str(asked.checkpoint)]
+        launch = Process("sctn", arguments, domain, logs)
+        try:
+            person = Person(browser, address_of(launch, lambda found, what, limit: operator.until(found, what, limit)), "Ada")
+            person.takes_control()
+            operator.next("heightmap")
+            person.button("Teach a new task").click()
+            for shown in range(len(TASK)):
+                show(person, operator, shown)
+            # The page takes the steps of a task that is repeated twice for those of the first time: each start has its own.
+            starts = range(asked.first_seed, asked.first_seed + asked.starts)
+            for seed in starts:
+                save(person, f"{NAME}_{seed}")
+            person.button("End the lesson").click()
+            all_went = []
+            for seed in starts:
+                reset(operator, seed)
+                went = repeat(person, operator, f"{NAME}_{seed}")
+                all_went.append(went)
+                words = "repeated" if went.done else f"not repeated: {went.steps} of {len(TASK)} steps"
+                print(f"start {seed}: {words}, {went.rejected} proposals rejected, {went.tried_again} motions tried again", flush=True)
+        finally:
+            launch.end()
+    done = sum(went.done for went in all_went)
+    alone = sum(went.needed_nobody for went in all_went)
+    print(f"repeated from {done} of {len(all_went)} other starts; in {alone} every first proposal was right")
+
+
+if __name__ == "__main__":
+    main()

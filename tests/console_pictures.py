@@ -59,12 +59,12 @@ def main() -> None:
             picture(ada.page, folder, "teach")
             ada.button("Carry it out").click()
             ada.button("As it should be: keep this step").click()
-            for name in ("red_block", "red_block_again"):
+            for name in ("one_block", "one_block_again"):
                 ada.page.get_by_label("Name of the task").fill(name)
                 ada.button("Save").click()
                 ada.sees(f"Saved as {name}.")
             ada.button("End the lesson").click()
-            for name, use in (("red_block", "learn from"), ("red_block_again", "hold out")):
+            for name, use in (("one_block", "learn from"), ("one_block_again", "hold out")):
                 ada.page.get_by_role("combobox", name=name, exact=True).select_option(use)
             ada.page.get_by_label("Name of the policy").fill("taught")
             ada.page.get_by_role("spinbutton", name="Steps").fill("40")

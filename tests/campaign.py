@@ -2,8 +2,11 @@
 
 python tests/campaign.py --faults 20 --seed 1 --json
 
-Every fault has a cell of its own: the simulated one as hardware behaves, the executor and the watchdog. The campaign plays everybody else.
-The same seed draws the same faults at the same moments.
+A cell is the simulated one as hardware behaves, the executor and the watchdog; the campaign plays everybody else. A few faults follow
+each other in one cell: the motion that shows that the arm goes on after a fault is the one that the next fault breaks off. The same seed
+draws the same faults at the same moments.
+
+--planted runs executors with a planted fault instead, and says which of them the monitor catches.
 """
 
 from __future__ import annotations
@@ -33,9 +36,11 @@ from cell_operator import EVENT, LATCHED, STREAM, Operator
 from fault_monitor import Monitor
 from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter
-from sctn_msgs.msg import Heightmap, PickPlace, StepConfirmation, StepResult
+from sctn_msgs.msg import Heightmap, PickPlace, PlannedMotion, StepConfirmation, StepResult
+from sctn_msgs.srv import ProposeHome
 from sensor_msgs.msg import JointState
 from test_refusals import Cell
+from ur_msgs.msg import IOStates
 
 OPERATOR = "end-to-end test"
 # A stop reaches the executor, its cancel the driver, and the arm brakes, which takes 0.12 s.
@@ -46,6 +51,12 @@ REST_AFTER_DEATH_S = REST_S + 0.3
 WATCH_S = 2.5
 # A motion of these proposals takes longer.
 LATEST_S = 3.0
+# Faults that follow each other in one cell.
+FAULTS_OF_A_CELL = 8
+# The arm has moved when a joint is so much further [rad].
+MOVED_RAD = 0.02
+# Output that switches suction: suction_pin of the executor.
+SUCTION_PIN = 16
 
 
 @dataclasses.dataclass
@@ -57,7 +68,17 @@ class Bench:
     monitor: Monitor
     executor: Process
     start: Callable[..., Process]
-    proposal: PickPlace
+    # The newest proposal, which moves the arm when a fault comes.
+    proposal: PickPlace | None = None
+    suction: bool = False
+
+    def positions(self) -> list[float]:
+        """Where the joints are [rad]."""
+        return list(self.operator.newest("joint_states").position)
+
+    def has_moved(self, before: list[float]) -> bool:
+        """Whether the arm has left a place."""
+        return max(abs(a - b) for a, b in zip(self.positions(), before, strict=True)) > MOVED_RAD
 
     def stopped(self, limit_s: float) -> None:
         self.monitor.on_stop(time.monotonic(), limit_s)
@@ -136,6 +157,20 @@ def another_executor(bench: Bench) -> None:
     bench.operator.confirm(bench.proposal.id, StepConfirmation.APPROVE)
 
 
+def stop_while_suction_is_on(bench: Bench) -> None:
+    """A stop when suction is on, at the earliest at the end of the descent."""
+    bench.operator.until(lambda: bench.suction, "suction", 60.0)
+    stop(bench)
+
+
+def unapproved_way_home(bench: Bench) -> None:
+    """After a stop the way home is proposed, and another proposal is approved: the arm stays."""
+    stop(bench)
+    bench.operator.spin(0.5)
+    propose_home(bench)
+    bench.operator.confirm(bench.proposal.id, StepConfirmation.APPROVE)
+
+
 FAULTS = [
     stop,
     stop_naming_no_proposal,
@@ -148,7 +183,26 @@ FAULTS = [
     spoofed_approvals,
     superseded_approval,
     another_executor,
+    stop_while_suction_is_on,
+    unapproved_way_home,
 ]
+
+# Faults planted in the executor, and what exposes them.
+PLANTED = {
+    "MovesUnapproved": stop,
+    "AnyApproval": spoofed_approvals,
+    "ApprovesSuperseded": superseded_approval,
+    "ApprovesTwice": spoofed_approvals,
+    "IgnoresStop": stop,
+    "IgnoresStopOfAnother": stop_naming_no_proposal,
+    "AnswersWithoutCancel": stop,
+    "GoesOnAfterStop": stop,
+    "GoesOnAfterFault": robot("protective_stop"),
+    "DropsOnStop": stop_while_suction_is_on,
+    "HomeUnasked": unapproved_way_home,
+    "NoHeartbeat": kill_executor,
+    "SecondExecutor": another_executor,
+}
 
 
 def arguments(node: str, **values: object) -> list[object]:
@@ -165,8 +219,9 @@ def arguments(node: str, **values: object) -> list[object]:
     return line
 
 
-def watch(operator: Operator, monitor: Monitor) -> None:
+def watch(bench: Bench) -> None:
     """Connects the monitor to what is said on the domain."""
+    monitor = bench.monitor
 
     def on_confirmation(said: StepConfirmation) -> None:
         if said.decision == StepConfirmation.APPROVE:
@@ -176,20 +231,28 @@ def watch(operator: Operator, monitor: Monitor) -> None:
         if result.outcome not in (StepResult.REFUSED, StepResult.REJECTED):
             monitor.on_end(result.proposal_id, time.monotonic())
 
-    node = operator.node
+    def on_pins(pins: IOStates) -> None:
+        bench.suction = any(output.pin == SUCTION_PIN and output.state for output in pins.digital_out_states)
+        monitor.on_suction(bench.suction, time.monotonic())
+
+    node = bench.operator.node
     node.create_subscription(PickPlace, "pick_place", lambda made: monitor.on_proposal(made.id), LATCHED)
+    node.create_subscription(PlannedMotion, "planned_motion", lambda plan: monitor.on_plan(plan.proposal_id), LATCHED)
     node.create_subscription(StepConfirmation, "step_confirmation", on_confirmation, EVENT)
     node.create_subscription(StepResult, "step_result", on_result, EVENT)
     node.create_subscription(JointState, "joint_states", lambda read: monitor.on_joints(read.position, time.monotonic()), STREAM)
+    node.create_subscription(IOStates, "io_and_status_controller/io_states", on_pins, STREAM)
 
 
 @contextlib.contextmanager
-def processes(domain: int, logs: pathlib.Path) -> Iterator[Callable[..., Process]]:
-    """Starts executables; they are ended at the end, also those that were frozen."""
+def processes(domain: int, logs: pathlib.Path, variables: dict[str, str]) -> Iterator[Callable[..., Process]]:
+    """Starts executables and ends them, also those that were frozen. With variables the executor is the one with a planted fault."""
     started: list[Process] = []
 
     def start(name: str, *line: object) -> Process:
-        started.append(Process(name, [str(argument) for argument in line], domain, logs))
+        if variables and name == "suction_executor":
+            name = "suction_executor_planted"
+        started.append(Process(name, [str(argument) for argument in line], domain, logs, variables))
         return started[-1]
 
     try:
@@ -201,39 +264,48 @@ def processes(domain: int, logs: pathlib.Path) -> Iterator[Callable[..., Process
             process.end()
 
 
-def run(fault: Callable[[Bench], None], moment_s: float) -> tuple[Monitor, str]:
-    """Injects a fault so long after the arm has begun to move. Returns what the monitor says, and how the run ended."""
+@contextlib.contextmanager
+def working_cell(planted: str | None = None) -> Iterator[Bench]:
+    """A cell whose executor is ready, maybe with a planted fault."""
     domain = free_domain()
-    monitor = Monitor(OPERATOR)
-    with tempfile.TemporaryDirectory() as logs, processes(domain, pathlib.Path(logs)) as start, Operator(domain) as operator:
+    variables = {"SCTN_PLANTED_FAULT": planted} if planted else {}
+    with tempfile.TemporaryDirectory() as logs, processes(domain, pathlib.Path(logs), variables) as start, Operator(domain) as operator:
         start("sim_workcell", *arguments("sim_workcell", seed=10000))
         start("motion_watchdog", "--ros-args", "--params-file", REPOSITORY / "config/motion_watchdog.yaml")
         executor = start("suction_executor", *arguments("suction_executor"))
         cell = Cell(operator)
         cell.wait_until_ready()
         operator.until(lambda: "motion_watchdog" in operator.node.get_node_names(), "watchdog", 30.0)
-        watch(operator, monitor)
+        bench = Bench(operator, cell, Monitor(OPERATOR), executor, start)
+        watch(bench)
         # The executor, and the monitor.
         operator.listeners = 2
         operator.spin(0.5)
-        proposal = propose(cell)
-        bench = Bench(operator, cell, monitor, executor, start, proposal)
-        before = list(operator.newest("joint_states").position)
-        operator.confirm(proposal.id, StepConfirmation.APPROVE)
-        operator.until(
-            lambda: max(abs(a - b) for a, b in zip(operator.newest("joint_states").position, before, strict=True)) > 0.02, "motion", 30.0
-        )
-        operator.spin(moment_s)
-        fault(bench)
-        operator.spin(WATCH_S)
-        return monitor, go_on(bench)
+        yield bench
 
 
-def go_on(bench: Bench) -> str:
-    """After the fault: an approval of a new proposal moves the arm again, or is refused for a reason."""
+def begin(bench: Bench) -> str:
+    """An approval of a new proposal moves the arm, or is refused for a reason."""
+    operator = bench.operator
+    bench.proposal = propose(bench.cell)
+    after = operator.count("step_result")
+    before = bench.positions()
+    operator.confirm(bench.proposal.id, StepConfirmation.APPROVE)
+
+    def outcome() -> str | None:
+        answers = [result for result in operator.received["step_result"][after:] if result.proposal_id == bench.proposal.id]
+        if answers and answers[-1].outcome == StepResult.REFUSED:
+            return f"refused: {answers[-1].reason}"
+        return "moves" if bench.has_moved(before) else None
+
+    return operator.until(outcome, "motion or refusal", 30.0)
+
+
+def recover(bench: Bench) -> None:
+    """After a fault: an executor that is dead is started again, the robot is ready again."""
     operator = bench.operator
     if bench.executor.exit_code is not None:
-        bench.start("suction_executor", *arguments("suction_executor"))
+        bench.executor = bench.start("suction_executor", *arguments("suction_executor"))
         # Acknowledged when the dead one is forgotten, which takes a while.
         bench.cell.observe()
     bench.set_fault("none")
@@ -241,19 +313,43 @@ def go_on(bench: Bench) -> str:
     operator.until(operator.executor_is_ready, "executor that is ready again", 60.0)
     bench.cell.wait_until_ready()
     operator.spin(0.5)
-    proposal = propose(bench.cell)
-    after = operator.count("step_result")
-    before = list(operator.newest("joint_states").position)
-    operator.confirm(proposal.id, StepConfirmation.APPROVE)
 
-    def outcome() -> str | None:
-        answers = [result for result in operator.received["step_result"][after:] if result.proposal_id == proposal.id]
-        if answers and answers[-1].outcome == StepResult.REFUSED:
-            return f"refused: {answers[-1].reason}"
-        moved = max(abs(a - b) for a, b in zip(operator.newest("joint_states").position, before, strict=True))
-        return "resumed" if moved > 0.02 else None
 
-    return operator.until(outcome, "motion or refusal after the fault", 30.0)
+def propose_home(bench: Bench) -> ProposeHome.Response:
+    """Has the way home proposed."""
+    client = bench.operator.node.create_client(ProposeHome, "suction_executor/propose_home")
+    bench.operator.until(client.service_is_ready, "service propose_home", 30.0)
+    answer = client.call_async(ProposeHome.Request())
+    bench.operator.until(answer.done, "answer of propose_home", 30.0)
+    return answer.result()
+
+
+def go_home(bench: Bench) -> bool:
+    """Brings the arm home by an approved proposal; whether it got there."""
+    home = propose_home(bench)
+    if not home.success:
+        return False
+    # The monitor has to know of it.
+    bench.operator.spin(0.2)
+    after = bench.operator.count("step_result")
+    bench.operator.confirm(home.proposal_id, StepConfirmation.APPROVE)
+    end = bench.operator.next("step_result", after, lambda result: result.proposal_id == home.proposal_id)
+    return end.outcome == StepResult.AT_HOME
+
+
+def inject(bench: Bench, fault: Callable[[Bench], None], moment_s: float) -> str:
+    """Injects a fault so long after the arm has begun to move. Returns how it went on."""
+    bench.operator.spin(moment_s)
+    fault(bench)
+    bench.operator.spin(WATCH_S)
+    recover(bench)
+    went_on = begin(bench)
+    if went_on == "moves":
+        return "resumed"
+    # From where the fault has left it the arm may not get to the pick: it goes home first.
+    if go_home(bench) and begin(bench) == "moves":
+        return f"resumed from home ({went_on})"
+    return went_on
 
 
 def propose(cell: Cell) -> PickPlace:
@@ -266,28 +362,43 @@ def propose(cell: Cell) -> PickPlace:
     return cell.propose(cell.observe(look))
 
 
+def drawn(count: int, seed: int) -> list[tuple[Callable[[Bench], None], float]]:
+    """So many faults and their moments. Every kind comes once before any comes again."""
+    draw = random.Random(seed)
+    kinds: list[Callable[[Bench], None]] = []
+    while len(kinds) < count:
+        kinds += draw.sample(FAULTS, len(FAULTS))
+    return [(fault, draw.uniform(0.0, LATEST_S)) for fault in kinds[:count]]
+
+
 def campaign(count: int, seed: int) -> dict[str, object]:
     """Injects so many faults; prints each with what came of it on standard error."""
-    draw = random.Random(seed)
     counts: collections.Counter[str] = collections.Counter()
     violations: list[str] = []
-    for number in range(count):
-        # Every kind once before any comes again.
-        if number % len(FAULTS) == 0:
-            order = draw.sample(FAULTS, len(FAULTS))
-        fault, moment_s = order[number % len(FAULTS)], draw.uniform(0.0, LATEST_S)
-        name = f"fault {number} of seed {seed}: {fault.__name__} at {moment_s:.2f} s"
-        try:
-            monitor, ended = run(fault, moment_s)
-        except (TimeoutError, AssertionError) as error:
-            counts["hung"] += 1
-            print(f"{name}: hung: {error}", file=sys.stderr)
-            continue
-        counts["resumed" if ended == "resumed" else "refused"] += 1
-        counts["unapproved_motions"] += any("without an approval" in violation for violation in monitor.violations)
-        counts["motions_after_stop"] += any("after it had to stop" in violation for violation in monitor.violations)
-        violations += [f"{name}: {violation}" for violation in monitor.violations[:1]]
-        print(f"{name}: at rest after {monitor.rest_after_s:.2f} s, {ended}; {monitor.violations[:1]}", file=sys.stderr, flush=True)
+    faults = drawn(count, seed)
+    number = 0
+    while number < count:
+        last = min(number + FAULTS_OF_A_CELL, count)
+        with working_cell() as bench:
+            went_on = begin(bench)
+            while number < last and went_on.startswith(("moves", "resumed")):
+                fault, moment_s = faults[number]
+                name = f"fault {number} of seed {seed}: {fault.__name__} at {moment_s:.2f} s"
+                number += 1
+                known = len(bench.monitor.violations)
+                try:
+                    went_on = inject(bench, fault, moment_s)
+                except (TimeoutError, AssertionError) as error:
+                    counts["hung"] += 1
+                    print(f"{name}: hung: {error}", file=sys.stderr, flush=True)
+                    break
+                found = bench.monitor.violations[known:]
+                counts["resumed" if went_on.startswith("resumed") else "refused"] += 1
+                counts["unapproved_motions"] += any("without an approval" in violation for violation in found)
+                counts["motions_after_stop"] += any("after it had to stop" in violation for violation in found)
+                counts["dropped_parts"] += any("dropped" in violation for violation in found)
+                violations += [f"{name}: {violation}" for violation in found[:1]]
+                print(f"{name}: {went_on}; {found[:1]}", file=sys.stderr, flush=True)
     return {
         "faults": count,
         "seed": seed,
@@ -296,17 +407,44 @@ def campaign(count: int, seed: int) -> dict[str, object]:
         "refused": counts["refused"],
         "unapproved_motions": counts["unapproved_motions"],
         "motions_after_stop": counts["motions_after_stop"],
+        "dropped_parts": counts["dropped_parts"],
         "hung_runs": counts["hung"],
         "violations": violations,
     }
+
+
+def planted_campaign(only: str | None = None) -> dict[str, str]:
+    """Runs the executor with each planted fault; what the monitor says of it, nothing where it is missed."""
+    caught: dict[str, str] = {}
+    for planted, fault in PLANTED.items():
+        if only not in (None, planted):
+            continue
+        with working_cell(planted) as bench:
+            try:
+                bench.monitor.violations.clear()
+                begin(bench)
+                inject(bench, fault, 1.0)
+            except (TimeoutError, AssertionError) as error:
+                print(f"{planted}: the run hangs: {error}", file=sys.stderr, flush=True)
+            caught[planted] = next(iter(bench.monitor.violations), "")
+        print(f"{planted}: {fault.__name__}: {caught[planted] or 'MISSED'}", file=sys.stderr, flush=True)
+    return caught
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--faults", type=int, default=20)
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--planted", action="store_true", help="run executors with planted faults: each has to be caught")
+    parser.add_argument("--only", help="with --planted: this fault alone")
     parser.add_argument("--json", action="store_true", help="print the result as one line of JSON")
     given = parser.parse_args()
+    if given.planted:
+        caught = planted_campaign(given.only)
+        missed = [planted for planted, violation in caught.items() if not violation]
+        result = {"planted": len(caught), "caught": len(caught) - len(missed), "missed": missed}
+        print(json.dumps(result) if given.json else "\n".join(f"{name}: {value}" for name, value in result.items()))
+        return 1 if missed else 0
     result = campaign(given.faults, given.seed)
     print(json.dumps(result) if given.json else "\n".join(f"{name}: {value}" for name, value in result.items()))
     return 1 if result["violations"] or result["hung_runs"] else 0

@@ -74,7 +74,9 @@ def environment(domain: int) -> dict[str, str]:
 class Process:
     """One running executable, its output in files."""
 
-    def __init__(self, name: str, arguments: list[str], domain: int, log_directory: pathlib.Path) -> None:
+    def __init__(
+        self, name: str, arguments: list[str], domain: int, log_directory: pathlib.Path, variables: dict[str, str] | None = None
+    ) -> None:
         self.name = name
         executable = BINARIES / name
         if not executable.exists():
@@ -87,7 +89,7 @@ class Process:
             self._child = subprocess.Popen(
                 [executable, *map(str, arguments)],
                 cwd=REPOSITORY,
-                env=environment(domain),
+                env={**environment(domain), **(variables or {})},
                 stdin=subprocess.DEVNULL,
                 stdout=output,
                 stderr=errors,

@@ -5,8 +5,9 @@ from __future__ import annotations
 import pytest
 from campaign import campaign
 from fault_monitor import Monitor
+from processes import BINARIES
 
-# Each takes some 15 s on two cores; `cargo xtask campaign` takes any number.
+# Each takes some 8 s on two cores; `cargo xtask campaign` takes any number.
 FAULTS = 8
 SEED = 17
 
@@ -53,6 +54,43 @@ def test_the_monitor_catches_a_second_motion_on_the_same_approval(monitor: Monit
     monitor.on_approval(2, "anna")
     move(monitor, 1.3)
     assert monitor.violations
+
+
+def test_the_monitor_catches_a_part_that_a_stop_drops(monitor: Monitor) -> None:
+    monitor.on_approval(2, "anna")
+    monitor.on_suction(True, 1.0)
+    monitor.on_suction(False, 1.1)
+    monitor.on_suction(True, 1.2)
+    assert not monitor.violations
+    monitor.on_stop(1.3, 0.3)
+    monitor.on_suction(True, 1.4)
+    assert not monitor.violations
+    monitor.on_suction(False, 1.8)
+    assert "suction is switched off 0.50 s after a stop" in monitor.violations[0]
+
+
+def test_the_monitor_catches_a_way_home_that_nobody_has_approved(monitor: Monitor) -> None:
+    monitor.on_plan(2)
+    monitor.on_plan(70)
+    monitor.on_approval(71, "anna")
+    move(monitor, 1.0)
+    assert "without an approval" in monitor.violations[0]
+    monitor.violations.clear()
+    monitor.on_approval(70, "anna")
+    move(monitor, 2.0)
+    assert not monitor.violations
+    # The plan of a proposal that was overtaken by it makes no way home of it.
+    monitor.on_plan(3)
+    monitor.on_proposal(3)
+    monitor.on_proposal(4)
+    monitor.on_stop(2.1, 0.0)
+    monitor.on_approval(3, "anna")
+    move(monitor, 3.0)
+    assert monitor.violations
+
+
+def test_the_executor_that_is_shipped_has_no_planted_faults() -> None:
+    assert b"SCTN_PLANTED_FAULT" not in (BINARIES / "suction_executor").read_bytes()
 
 
 def test_the_monitor_lets_an_approved_motion_and_the_noise_of_an_arm_at_rest_pass(monitor: Monitor) -> None:

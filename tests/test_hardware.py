@@ -5,12 +5,14 @@ from __future__ import annotations
 import pathlib
 import signal
 import time
+from collections.abc import Callable
 
 import numpy as np
 import pytest
 from cell_operator import Operator
 from processes import REPOSITORY
 from sctn_msgs.msg import Heightmap, PickPlace, StepConfirmation, StepResult
+from sctn_msgs.srv import ProposeHome
 from test_refusals import Cell
 
 REALISTIC = REPOSITORY / "config/hardware/realistic.yaml"
@@ -41,14 +43,19 @@ def cell(start, operator: Operator) -> Cell:
     return cell
 
 
-def propose(cell: Cell) -> PickPlace:
-    """A proposal from a heightmap of now, in which the table is there: black at height 0 is what no camera has seen."""
+def look_at(cell: Cell) -> Callable[[Heightmap], None]:
+    """A heightmap of now, in which the table is there: black at height 0 is what no camera has seen."""
 
     def look(heightmap: Heightmap) -> None:
         heightmap.rgb = np.full(len(heightmap.rgb), 90, dtype=np.uint8)
         heightmap.header.stamp = cell.operator.newest("joint_states").header.stamp
 
-    return cell.propose(cell.observe(look))
+    return look
+
+
+def propose(cell: Cell) -> PickPlace:
+    """A proposal from a heightmap of now."""
+    return cell.propose(cell.observe(look_at(cell)))
 
 
 def wait_until_moving(cell: Cell) -> None:
@@ -105,6 +112,7 @@ def test_an_executor_that_is_told_to_end_in_mid_motion_stops_the_arm_first(cell:
     assert moved_s < REST_AFTER_STOP_S
     result = cell.operator.next("step_result", after, lambda result: result.proposal_id == proposal.id)
     assert result.outcome == StepResult.STOPPED, result
+    assert "told to end" in result.reason, result.reason
     assert cell.executor.wait(5.0) == 0
 
 
@@ -166,6 +174,36 @@ def test_a_heightmap_with_the_arm_in_view_is_no_ground_to_move_on(cell: Cell) ->
     assert rest_after(cell, 1.0) == 0.0
 
 
+def test_an_approval_on_a_view_that_is_old_moves_nothing(cell: Cell) -> None:
+    proposal = propose(cell)
+    # Fusion or cameras have died: config/hardware/realistic.yaml allows 3 s.
+    cell.operator.spin(3.2)
+    refused = cell.decide(proposal.id)
+    assert refused.outcome == StepResult.REFUSED
+    assert "observation_max_age_s" in refused.reason, refused.reason
+    assert rest_after(cell, 1.0) == 0.0
+    # With a fresh one the same proposal moves.
+    cell.observe(look_at(cell))
+    cell.operator.confirm(proposal.id, StepConfirmation.APPROVE)
+    wait_until_moving(cell)
+
+
+def test_a_goal_that_the_driver_rejects_is_a_fault_and_nothing_moves(start, operator: Operator) -> None:
+    controller = "scaled_joint_trajectory_controller"
+    start("sim_workcell", *parameters("sim_workcell", seed=10000, hardware__inactive_controllers=f"[{controller}]"))
+    cell = Cell(operator)
+    # An executor that looks at the controllers moves nothing at all: this one asks the driver.
+    start("suction_executor", *parameters("suction_executor", driver__check_controllers="false"))
+    cell.wait_until_ready()
+    proposal = propose(cell)
+    result = cell.decide(proposal.id)
+    assert result.outcome == StepResult.FAULT, result
+    assert "reject" in result.reason, result.reason
+    assert rest_after(cell, 1.0) == 0.0
+    # It is over: the same approval moves nothing later.
+    assert cell.decide(proposal.id).outcome == StepResult.REFUSED
+
+
 def test_an_arm_that_leaves_its_path_is_a_fault_and_stays_where_it_is(start, operator: Operator) -> None:
     start("sim_workcell", *parameters("sim_workcell", seed=10000, hardware__servo_delay_s=0.5))
     cell = Cell(operator)
@@ -224,3 +262,34 @@ def test_placing_completes_with_a_driver_as_it_is(start, operator: Operator, tmp
     took_s = time.monotonic() - begin
     print(f"placing: {len(outcomes)} motions in {took_s:.0f} s, total reward {operator.newest('reward').total:.3f}")
     assert operator.newest("reward").complete
+
+
+def test_the_way_home_moves_only_by_an_approval_of_that_very_proposal(cell: Cell) -> None:
+    client = cell.operator.node.create_client(ProposeHome, "suction_executor/propose_home")
+
+    def propose_home() -> ProposeHome.Response:
+        cell.operator.until(client.service_is_ready, "service propose_home", 30.0)
+        answer = client.call_async(ProposeHome.Request())
+        cell.operator.until(answer.done, "answer of propose_home", 30.0)
+        return answer.result()
+
+    proposal = propose(cell)
+    after = cell.operator.count("step_result")
+    cell.operator.confirm(proposal.id, StepConfirmation.APPROVE)
+    wait_until_moving(cell)
+    busy = propose_home()
+    assert not busy.success and "being carried out" in busy.message
+    cell.operator.confirm(proposal.id, StepConfirmation.STOP)
+    cell.operator.next("step_result", after, lambda result: result.proposal_id == proposal.id)
+    first = propose_home()
+    assert first.success and first.needs_approval, first.message
+    # Said twice it is the same one; no other approval moves the arm, and a stop withdraws it.
+    assert propose_home().proposal_id == first.proposal_id
+    assert cell.decide(proposal.id).outcome == StepResult.REFUSED
+    assert cell.decide(first.proposal_id, StepConfirmation.STOP).outcome == StepResult.STOPPED
+    assert cell.decide(first.proposal_id).outcome == StepResult.REFUSED
+    assert rest_after(cell, 1.0) == 0.0
+    second = propose_home()
+    assert second.proposal_id != first.proposal_id
+    assert cell.decide(second.proposal_id).outcome == StepResult.AT_HOME
+    assert cell.decide(second.proposal_id).outcome == StepResult.REFUSED

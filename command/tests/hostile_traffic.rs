@@ -333,7 +333,7 @@ async fn hostile_traffic_on_every_topic_and_service_ends_no_node() -> Result<()>
     });
     let _nodes = attacked.await??;
 
-    // Garbage that can be read was the driver's state, a call of `home` and a proposal in the place of the
+    // Garbage that can be read was the driver's state, a call of `propose_home` and a proposal in the place of the
     // one that was there. What is true is said again, and the run goes on from where it was; topics are
     // not ordered among each other, so that it may have to be said more than once.
     let mut id = first.id;

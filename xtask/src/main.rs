@@ -58,12 +58,15 @@ enum Task {
     },
     /// Inject faults at random moments of motions, while an independent monitor reads the joints and the approvals
     Campaign {
-        /// How many faults; each has a cell of its own and takes some 10 s
+        /// How many faults; each takes some 8 s
         #[arg(long, default_value_t = 20)]
         faults: u32,
         /// The same seed draws the same faults at the same moments
         #[arg(long, default_value_t = 1)]
         seed: u64,
+        /// Run executors with a planted fault each instead: the monitor has to catch all of them
+        #[arg(long)]
+        planted: bool,
         /// Print the result as one line of JSON
         #[arg(long)]
         json: bool,
@@ -84,7 +87,12 @@ fn main() -> Result<()> {
         Task::Check { packages } => check::run_checks(&packages),
         Task::Test { only, pytest } => stage::run_all(&only, &pytest),
         Task::Demo { problem, seed } => demo::run_problem(&problem, seed),
-        Task::Campaign { faults, seed, json } => campaign::run_faults(faults, seed, json),
+        Task::Campaign {
+            faults,
+            seed,
+            planted,
+            json,
+        } => campaign::run_faults(faults, seed, planted, json),
         Task::Licences => licences::check(),
     }
 }

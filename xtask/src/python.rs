@@ -24,7 +24,7 @@ struct Distribution {
 const JAZZY: Distribution = Distribution {
     folder: ".venv",
     requirements: "tests/requirements.txt",
-    packages: &["msgs", "tests/tf2_msgs"],
+    packages: &["msgs", "tests/tf2_msgs", "tests/ur_msgs"],
 };
 
 /// The table of docs/ros2.md is tested against it too.

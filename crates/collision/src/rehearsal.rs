@@ -3,7 +3,7 @@
 use crate::{Carried, Clearance, Collision, CollisionChecker, Contact, Scene, Terrain, lift_out};
 use heightmap::Heightmap;
 use nalgebra::{Point2, Vector3};
-use pick_place::{ExecuteError, Outcome, PickPlace, PrimitiveSettings, Robot};
+use pick_place::{ExecuteError, Outcome, PickPlace, PrimitiveSettings, Robot, go_home};
 use ur5::{Arm, JointTrajectory, Joints};
 
 /// The cup may touch what is this near its axis (m), beside what it holds.
@@ -58,6 +58,38 @@ pub fn rehearse(
     robot.contact = Some(robot.contact_here());
     let outcome = pick_place::execute(&mut robot, arm, action, settings, |_| ())?;
     Ok((outcome, robot.clearance))
+}
+
+/// Plans the way home from where the arm is and checks it, like [`rehearse`]. `carried`: what the gripper holds; `heightmap` must not show it, nor the arm.
+///
+/// # Errors
+/// What cannot be planned, or the first collision with the phase it is in.
+pub fn rehearse_home(
+    checker: &CollisionChecker,
+    arm: &Arm,
+    settings: &PrimitiveSettings,
+    joints: &Joints,
+    carried: Option<Carried>,
+    heightmap: Option<&Heightmap>,
+) -> Result<Clearance, ExecuteError<Box<Collision>>> {
+    let mut robot = Rehearsal {
+        checker,
+        arm,
+        joints: *joints,
+        holds: carried.is_some(),
+        heightmap: None,
+        terrain: heightmap.map(Terrain::new),
+        carried,
+        contact: None,
+        clearance: Clearance {
+            least_m: f64::INFINITY,
+            samples: 0,
+        },
+    };
+    // The arm may have been stopped on the table.
+    robot.contact = Some(robot.contact_here());
+    go_home(&mut robot, arm, settings)?;
+    Ok(robot.clearance)
 }
 
 impl Rehearsal<'_> {

@@ -8,6 +8,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use heightmap::{Change, ChangeRules, Heightmap, Workspace, largest_change};
+use nalgebra::SVector;
 use pick_place::{PickPlace, PrimitiveSettings};
 
 use crate::mutation::{Mutation, planted};
@@ -181,6 +182,12 @@ pub enum Refusal {
         /// The proposal.
         id: ProposalId,
     },
+    /// The arm is not where the way home begins.
+    #[error("proposal {id}: the arm has moved since its way home was proposed: call for it again")]
+    HomeFromElsewhere {
+        /// The proposal.
+        id: ProposalId,
+    },
     /// The robot cannot move now, or not so.
     #[error("proposal {id}: {reason}")]
     Robot {
@@ -285,6 +292,8 @@ pub struct Report {
 pub enum GateAction {
     /// Move; [`ApprovalGate::finish`] has to follow.
     Move(Box<Proposal>),
+    /// Bring the arm home, by this proposal; [`ApprovalGate::finish`] has to follow.
+    GoHome(ProposalId),
     /// Stop the motion under way.
     Cancel,
     /// Say this.
@@ -301,6 +310,26 @@ pub trait RobotState {
     /// # Errors
     /// Says what cannot be planned.
     fn plan(&self, proposal: &Proposal) -> Result<(), String>;
+
+    /// Plans the way home from where the arm is. Returns where that is (rad).
+    ///
+    /// # Errors
+    /// Says what cannot be planned, or what would be hit.
+    fn plan_home(&self) -> Result<JointPositions, String>;
+}
+
+/// Positions of the arm's joints (rad).
+pub type JointPositions = SVector<f64, 6>;
+
+/// The arm is where it was when no joint is further from there (rad): encoders have noise.
+const AT_REST_RAD: f64 = 1e-3;
+
+/// A way home that can be approved.
+#[derive(Clone, Copy, Debug)]
+struct Home {
+    id: ProposalId,
+    /// Where it begins.
+    from_rad: JointPositions,
 }
 
 /// The answer to a confirmation.
@@ -346,8 +375,10 @@ pub struct ApprovalGate {
     invalid: VecDeque<(ProposalId, InvalidProposal)>,
     waiting: VecDeque<Waiting>,
     moving: Option<ProposalId>,
-    /// The arm is on its way home at an operator's call.
-    homing: bool,
+    /// The way home that can be approved. Other proposals do not supersede it; a stop and any motion withdraw it.
+    home: Option<Home>,
+    /// The way home that the arm is on.
+    homing: Option<ProposalId>,
     /// Heightmaps from before the end of the last motion are no ground to move on.
     moved_until: Option<Duration>,
     /// Whether new proposals move by themselves.
@@ -365,7 +396,8 @@ impl ApprovalGate {
             invalid: VecDeque::new(),
             waiting: VecDeque::new(),
             moving: None,
-            homing: false,
+            home: None,
+            homing: None,
             moved_until: None,
             automatic: rules.require_approval != RequireApproval::Always,
             rules,
@@ -393,8 +425,15 @@ impl ApprovalGate {
         self.automatic
     }
 
-    /// Whether the executor approves this proposal itself: it is the newest one, and the rules do not ask for an approval of it.
+    /// Whether the executor approves this proposal itself: it is the newest one, and the rules do not ask for an approval of it. A way
+    /// home has no probability of success.
     pub fn moves_unasked(&self, id: ProposalId) -> bool {
+        if self.home.is_some_and(|home| home.id == id) {
+            if planted(Mutation::HomeMovesUnasked) {
+                return true;
+            }
+            return self.automatic && self.rules.require_approval == RequireApproval::Never;
+        }
         let newest = self.newest.as_ref();
         let newest = newest.filter(|newest| newest.proposal.id == id);
         self.automatic
@@ -472,10 +511,7 @@ impl ApprovalGate {
         if !planted(Mutation::SupersededStaysPending) {
             self.close_pending(ProposalStatus::Superseded);
         }
-        if self.statuses.len() == PROPOSALS {
-            self.statuses.pop_front();
-        }
-        self.statuses.push_back((id, ProposalStatus::Pending));
+        self.remember(id);
         self.newest = Some(Newest {
             proposal,
             invalid: None,
@@ -483,6 +519,14 @@ impl ApprovalGate {
         });
         self.find_source();
         Proposed::Pending
+    }
+
+    /// A new proposal is pending.
+    fn remember(&mut self, id: ProposalId) {
+        if self.statuses.len() == PROPOSALS {
+            self.statuses.pop_front();
+        }
+        self.statuses.push_back((id, ProposalStatus::Pending));
     }
 
     fn why_invalid(&self, id: ProposalId) -> Option<&InvalidProposal> {
@@ -634,22 +678,41 @@ impl ApprovalGate {
         }
     }
 
-    /// Asks whether the arm may go home, as an operator has called for; [`Self::finish`] has to follow where it may.
+    /// Proposes the way home from where the arm is; `id` is for a new proposal. Returns the id of the one that can be approved now: the
+    /// one before where the arm has not moved since.
     ///
     /// # Errors
-    /// Says why not.
-    pub fn go_home(&mut self, robot: &impl RobotState) -> Result<(), String> {
+    /// Says why there is no way home now.
+    pub fn propose_home(
+        &mut self,
+        id: ProposalId,
+        robot: &impl RobotState,
+    ) -> Result<ProposalId, String> {
         if let Some(id) = self.moving {
             return Err(format!("proposal {id} is being carried out"));
+        }
+        if self.homing.is_some() {
+            return Err("the arm is on its way home".to_owned());
         }
         if let Some(obstacle) = robot.obstacle() {
             return Err(obstacle);
         }
-        self.homing = true;
-        Ok(())
+        let from_rad = robot.plan_home()?;
+        if let Some(home) = &self.home
+            && home.is_from(&from_rad)
+        {
+            return Ok(home.id);
+        }
+        if self.status(id).is_some() {
+            return Err(format!("proposal {id} is another one"));
+        }
+        self.close_home(ProposalStatus::Superseded);
+        self.remember(id);
+        self.home = Some(Home { id, from_rad });
+        Ok(id)
     }
 
-    /// The motion of [`GateAction::Move`] or [`Self::go_home`] has ended; `until` is the ROS time from which on heightmaps
+    /// The motion of [`GateAction::Move`] or [`GateAction::GoHome`] has ended; `until` is the ROS time from which on heightmaps
     /// show its result. `broken_off`: by a stop or a fault, after which nothing goes on by itself.
     pub fn finish(&mut self, until: Duration, broken_off: bool) -> Vec<GateAction> {
         let moved = self.moving.take();
@@ -660,7 +723,11 @@ impl ApprovalGate {
             };
             self.set_status(id, done);
         }
-        if moved.is_some() || std::mem::take(&mut self.homing) {
+        let homed = self.homing.take();
+        if let Some(id) = homed {
+            self.set_status(id, ProposalStatus::Done);
+        }
+        if moved.is_some() || homed.is_some() {
             self.moved_until = Some(until).filter(|_| !planted(Mutation::ApprovalMovesTwice));
         }
         if !broken_off {
@@ -675,6 +742,7 @@ impl ApprovalGate {
         if !planted(Mutation::WaitingSurvivesDeactivation) {
             self.waiting.clear();
         }
+        self.close_home(ProposalStatus::Withdrawn);
     }
 
     fn approve(&mut self, id: ProposalId, robot: &impl RobotState) -> Verdict {
@@ -692,8 +760,13 @@ impl ApprovalGate {
         {
             return Verdict::Refuse(Refusal::Busy { id, moving });
         }
-        if self.homing {
+        if self.homing.is_some() {
             return Verdict::Refuse(Refusal::Homing { id });
+        }
+        if let Some(home) = self.home
+            && (home.id == id || planted(Mutation::AnyApprovalMovesHome))
+        {
+            return self.approve_home(home, robot);
         }
         // Only the newest proposal is pending.
         let newest = match &self.newest {
@@ -730,6 +803,9 @@ impl ApprovalGate {
             return Verdict::Refuse(Refusal::Robot { id, reason });
         }
         let proposal = Box::new(proposal.clone());
+        if !planted(Mutation::HomeSurvivesMotion) {
+            self.close_home(ProposalStatus::Withdrawn);
+        }
         self.set_status(id, ProposalStatus::Moving);
         self.moving = Some(id);
         // After a stop or a fault an approval lets things go on.
@@ -737,10 +813,31 @@ impl ApprovalGate {
         Verdict::Act(GateAction::Move(proposal))
     }
 
+    /// Approves a way home. It lets nothing else go on after a stop or a fault.
+    fn approve_home(&mut self, home: Home, robot: &impl RobotState) -> Verdict {
+        let id = home.id;
+        if let Some(reason) = robot.obstacle() {
+            return Verdict::Refuse(Refusal::Robot { id, reason });
+        }
+        match robot.plan_home() {
+            Ok(from_rad) if home.is_from(&from_rad) => {}
+            Ok(_) => {
+                self.close_home(ProposalStatus::Withdrawn);
+                return Verdict::Refuse(Refusal::HomeFromElsewhere { id });
+            }
+            Err(reason) => return Verdict::Refuse(Refusal::Robot { id, reason }),
+        }
+        self.home = None;
+        self.set_status(id, ProposalStatus::Moving);
+        self.homing = Some(id);
+        Verdict::Act(GateAction::GoHome(id))
+    }
+
     fn reject(&mut self, id: ProposalId) -> Verdict {
         match self.status(id) {
             None => self.unknown(id),
             Some(ProposalStatus::Pending) => {
+                self.home.take_if(|home| home.id == id);
                 self.set_status(id, ProposalStatus::Rejected);
                 Verdict::Report(StepOutcome::Rejected, "rejected by the operator".into())
             }
@@ -750,8 +847,11 @@ impl ApprovalGate {
 
     /// A stop is honoured whatever proposal it names.
     fn stop(&mut self, id: ProposalId) -> Verdict {
-        let withdrawn = self.close_pending(ProposalStatus::Withdrawn);
-        if self.moving.is_some() || self.homing {
+        let mut withdrawn = self.close_pending(ProposalStatus::Withdrawn);
+        if !planted(Mutation::HomeSurvivesStop) {
+            withdrawn |= self.close_home(ProposalStatus::Withdrawn);
+        }
+        if self.moving.is_some() || self.homing.is_some() {
             return Verdict::Act(GateAction::Cancel);
         }
         match self.status(id) {
@@ -804,16 +904,34 @@ impl ApprovalGate {
         }
     }
 
-    /// Says whether a proposal was pending.
+    /// Says whether a proposal was pending, the way home apart.
     fn close_pending(&mut self, status: ProposalStatus) -> bool {
+        let home = self.home.map(|home| home.id);
         let mut known = self.statuses.iter_mut().rev();
-        match known.find(|(_, known)| *known == ProposalStatus::Pending) {
+        let pending =
+            known.find(|(id, known)| *known == ProposalStatus::Pending && Some(*id) != home);
+        match pending {
             Some((_, pending)) => {
                 *pending = status;
                 true
             }
             None => false,
         }
+    }
+
+    /// Says whether a way home was proposed.
+    fn close_home(&mut self, status: ProposalStatus) -> bool {
+        let home = self.home.take();
+        if let Some(home) = home {
+            self.set_status(home.id, status);
+        }
+        home.is_some()
+    }
+}
+
+impl Home {
+    fn is_from(&self, joints_rad: &JointPositions) -> bool {
+        (self.from_rad - joints_rad).amax() <= AT_REST_RAD
     }
 }
 

@@ -15,6 +15,14 @@ pub(crate) enum Mutation {
     AnyApprovalMovesNewest,
     /// An approval while the arm moves is accepted.
     MovesWhileMoving,
+    /// A call for the way home moves the arm.
+    HomeMovesUnasked,
+    /// The proposed way home can still be approved after a stop.
+    HomeSurvivesStop,
+    /// The proposed way home can still be approved after another motion.
+    HomeSurvivesMotion,
+    /// Any approval moves the arm home where a way home is proposed.
+    AnyApprovalMovesHome,
     /// A decision that waits for its result is lost when another proposal comes.
     SupersessionDropsDecision,
     /// A decision counts before the arm has moved.
@@ -32,13 +40,17 @@ pub(crate) enum Mutation {
 impl Mutation {
     /// All of them.
     #[cfg(test)]
-    pub(crate) const ALL: [Self; 12] = [
+    pub(crate) const ALL: [Self; 16] = [
         Self::ApprovalMovesTwice,
         Self::SupersededStaysPending,
         Self::WaitingSurvivesStop,
         Self::WaitingSurvivesDeactivation,
         Self::AnyApprovalMovesNewest,
         Self::MovesWhileMoving,
+        Self::HomeMovesUnasked,
+        Self::HomeSurvivesStop,
+        Self::HomeSurvivesMotion,
+        Self::AnyApprovalMovesHome,
         Self::SupersessionDropsDecision,
         Self::AdvanceWithoutMotion,
         Self::ResultCountsTwice,

@@ -392,6 +392,9 @@ impl GoalTracker {
     /// The executor has reported.
     pub fn on_result(&mut self, result: &StepResult) -> Change {
         let id = result.proposal_id;
+        if result.outcome.is_of_home() {
+            return Change::None;
+        }
         // The stop itself may have arrived before.
         if result.outcome == StepOutcome::Stopped && result.arm_moved() && self.is_current(id) {
             self.moved_until = result.stamp;

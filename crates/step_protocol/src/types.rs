@@ -40,11 +40,15 @@ pub enum StepOutcome {
     Fault = 8,
     /// The operator stopped the motion, or withdrew the proposal.
     Stopped = 9,
+    /// The way home was carried out.
+    AtHome = 10,
+    /// The way home was broken off by a stop or a fault.
+    NotHome = 11,
 }
 
 impl StepOutcome {
     /// All outcomes, in the order of their codes.
-    pub const ALL: [Self; 9] = [
+    pub const ALL: [Self; 11] = [
         Self::Placed,
         Self::NoContact,
         Self::GraspFailed,
@@ -54,6 +58,8 @@ impl StepOutcome {
         Self::Rejected,
         Self::Fault,
         Self::Stopped,
+        Self::AtHome,
+        Self::NotHome,
     ];
 
     /// The constant of the message `StepResult`.
@@ -72,6 +78,11 @@ impl StepOutcome {
         !matches!(self, Self::Refused | Self::Rejected)
     }
 
+    /// Whether it speaks of a way home, which is no step of a run.
+    pub const fn is_of_home(self) -> bool {
+        matches!(self, Self::AtHome | Self::NotHome)
+    }
+
     /// [`Self::arm_moved`] where it is known where the proposal stands: a stop that only withdrew it moved nothing.
     pub fn arm_moved_for(self, status: Option<ProposalStatus>) -> bool {
         let withdrawn = status == Some(ProposalStatus::Withdrawn);
@@ -86,7 +97,12 @@ impl StepOutcome {
             Self::GraspFailed => Some(Outcome::GraspFailed),
             Self::Dropped => Some(Outcome::Dropped),
             Self::LagAborted => Some(Outcome::LagAborted),
-            Self::Refused | Self::Rejected | Self::Fault | Self::Stopped => None,
+            Self::Refused
+            | Self::Rejected
+            | Self::Fault
+            | Self::Stopped
+            | Self::AtHome
+            | Self::NotHome => None,
         }
     }
 
@@ -102,6 +118,8 @@ impl StepOutcome {
             Self::Rejected => "rejected",
             Self::Fault => "fault",
             Self::Stopped => "stopped",
+            Self::AtHome => "at home",
+            Self::NotHome => "not at home",
         }
     }
 }
@@ -219,7 +237,7 @@ impl fmt::Display for ProposalStatus {
             Self::Moving => "is already being carried out",
             Self::Done => "was already carried out",
             Self::Rejected => "was already rejected",
-            Self::Withdrawn => "was withdrawn by a stop",
+            Self::Withdrawn => "was withdrawn",
         })
     }
 }

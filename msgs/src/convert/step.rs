@@ -330,6 +330,8 @@ mod tests {
         assert_eq!(StepOutcome::Rejected.code(), Message::REJECTED);
         assert_eq!(StepOutcome::Fault.code(), Message::FAULT);
         assert_eq!(StepOutcome::Stopped.code(), Message::STOPPED);
+        assert_eq!(StepOutcome::AtHome.code(), Message::AT_HOME);
+        assert_eq!(StepOutcome::NotHome.code(), Message::NOT_HOME);
         assert_eq!(ProposalStatus::Pending.code(), Message::PROPOSAL_PENDING);
         assert_eq!(
             ProposalStatus::Superseded.code(),

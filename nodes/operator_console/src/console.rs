@@ -29,7 +29,7 @@ pub enum Command {
     Confirm(StepConfirmation),
     /// Publish this proposal of the operator's.
     Propose(Box<PickPlace>),
-    /// Call the executor's service `home`; for whom.
+    /// Have the executor propose the way home; for whom.
     Home(String),
     /// Have the oracle latch this step again; for whom.
     SetStep(u32, String),
@@ -319,6 +319,17 @@ impl State {
         self.sessions.check_operator(viewer)?;
         let name = self.sessions.name(viewer).to_owned();
         self.send(Command::Home(name))
+    }
+
+    /// The way home that an operator has asked for is proposed: their asking is its approval.
+    pub(crate) fn approve_home(&mut self, proposal_id: u64, operator_name: String) {
+        // While the console is inactive nothing is sent, and the arm stays.
+        let _ = self.confirm(StepConfirmation {
+            proposal_id,
+            decision: StepConfirmation::APPROVE,
+            operator_name,
+            ..StepConfirmation::default()
+        });
     }
 
     /// The operator continues the run with a step, the present one or another.

@@ -31,12 +31,11 @@ use msgs::convert;
 use msgs::diagnostic_msgs::DiagnosticArray;
 use msgs::sctn_msgs::{
     ConfirmationRefused, Goal, Heightmap, LoadCheckpoint, LoadCheckpointRequest, LoadDemonstration,
-    LoadDemonstrationRequest, OperatorPresence, PickPlace, PlannedMotion, Reward, SetStep,
-    SetStepRequest, StepConfirmation, StepResult,
+    LoadDemonstrationRequest, OperatorPresence, PickPlace, PlannedMotion, ProposeHome,
+    ProposeHomeRequest, Reward, SetStep, SetStepRequest, StepConfirmation, StepResult,
 };
 use msgs::sensor_msgs::{Image, JointState};
 use msgs::std_msgs::{self, Bool, Header};
-use msgs::std_srvs::{Trigger, TriggerRequest};
 use msgs::ur_dashboard_msgs::{RobotMode, SafetyMode};
 use msgs::ur_msgs::{Digital, IOStates};
 use node_kit::{Active, CallOptions, Level, Node, Publisher, Qos, ServiceClient};
@@ -63,7 +62,7 @@ const PRESENCE_PERIOD: Duration = Duration::from_millis(200);
 const JOINTS_PERIOD: Duration = Duration::from_millis(100);
 const CHOOSE_ANOTHER: &str =
     "Choose another demonstration, or look whether the goal oracle is at work.";
-/// How long the way home may take.
+/// How long the plan of the way home may take.
 const HOME_TIMEOUT: CallOptions = CallOptions {
     attempts: 1,
     timeout: Duration::from_secs(60),
@@ -107,7 +106,7 @@ pub async fn configure(
         confirmations: node.publisher("step_confirmation", Qos::Event)?,
         proposals: node.publisher("pick_place", Qos::Latched)?,
         presence: node.publisher("operator_presence", Qos::Event)?,
-        home: Arc::new(node.service_client(&format!("{}/home", parameters.executor))?),
+        home: Arc::new(node.service_client(&format!("{}/propose_home", parameters.executor))?),
         set_step: Arc::new(node.service_client(&format!("{}/set_step", parameters.goal_oracle))?),
         load: Arc::new(
             node.service_client(&format!("{}/load_demonstration", parameters.goal_oracle))?,
@@ -146,7 +145,7 @@ pub struct ConsoleNode {
     confirmations: Publisher<StepConfirmation>,
     proposals: Publisher<PickPlace>,
     presence: Publisher<OperatorPresence>,
-    home: Arc<ServiceClient<Trigger>>,
+    home: Arc<ServiceClient<ProposeHome>>,
     set_step: Arc<ServiceClient<SetStep>>,
     load: Arc<ServiceClient<LoadDemonstration>>,
     library: Arc<Library>,
@@ -397,20 +396,23 @@ impl ConsoleNode {
                 node.spawn(async move {
                     // The executor has to hear that the operator is present before the call, also where they have just taken control.
                     tokio::time::sleep(PRESENCE_PERIOD).await;
-                    let answer = client.call(&TriggerRequest::default(), &HOME_TIMEOUT).await;
-                    let (kind, reason) = match answer {
-                        Ok(answer) if answer.success => ("note", "The arm is at home.".to_owned()),
-                        Ok(answer) => (
-                            "refusal",
-                            format!("The arm did not go home: {}", answer.message),
-                        ),
-                        Err(error) => ("refusal", format!("The arm did not go home: {error}")),
+                    let answer = client
+                        .call(&ProposeHomeRequest::default(), &HOME_TIMEOUT)
+                        .await;
+                    let reason = match answer {
+                        Ok(answer) if answer.success => {
+                            if answer.needs_approval {
+                                let id = answer.proposal_id;
+                                console.change(|state, _| state.approve_home(id, name));
+                            }
+                            return;
+                        }
+                        Ok(answer) => answer.message,
+                        Err(error) => error.to_string(),
                     };
-                    let advice = match kind {
-                        "note" => "",
-                        _ => refusal::advice(&reason),
-                    };
-                    console.change(|state, now| state.run.note(kind, reason, advice, now));
+                    let advice = refusal::advice(&reason);
+                    let text = format!("The arm did not go home: {reason}");
+                    console.change(|state, now| state.run.note("refusal", text, advice, now));
                 });
             }
             Command::Load(path, name) => {

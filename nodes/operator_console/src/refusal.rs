@@ -25,7 +25,7 @@ impl Refusal {
 }
 
 /// What a person should do about a reason why a proposal that stands may not be carried out now: part of the reason, advice.
-const ADVICE: [(&str, &str); 12] = [
+const ADVICE: [(&str, &str); 13] = [
     (
         "no operator is present",
         "Keep the page of the operator open and in sight while the arm moves.",
@@ -49,6 +49,10 @@ const ADVICE: [(&str, &str); 12] = [
     (
         "out of reach",
         "The arm cannot get there. Reject it: the policy will propose something else.",
+    ),
+    (
+        "the way home: ",
+        "Free the arm with the teach pendant, then call it home again.",
     ),
     (
         "on its way home",

@@ -33,8 +33,8 @@ pub(crate) use self::robot::DriverRobot;
 /// Why the robot does not go on. Suction stays as it is: holding is safer than dropping.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub(crate) enum DriverError {
-    /// The operator said stop.
-    #[error("stopped by the operator")]
+    /// The motion was stopped; whoever stopped it knows why.
+    #[error("stopped")]
     Stopped,
     /// The driver failed, stopped by itself, or was lost.
     #[error("{0}")]

@@ -4,17 +4,26 @@ use std::convert::Infallible;
 use std::sync::Arc;
 use std::time::Duration;
 
+use collision::{Carried, CollisionChecker, lift_out, rehearse_home};
 use heightmap::Heightmap;
 use msgs::convert::{self, ConvertError};
 use msgs::std_msgs::Header;
 use msgs::{sctn_msgs, trajectory_msgs};
-use pick_place::Robot;
-use step_protocol::{Proposal, RobotState};
+use nalgebra::{Isometry2, Point2};
+use pick_place::{PrimitiveSettings, Robot, go_home};
+use step_protocol::{JointPositions, Proposal, RobotState};
 use ur5::{Arm, JointTrajectory, Joints, TrajectoryPoint};
 
 use crate::parameters::{Contact, ContactSign};
 use crate::status::DriverStatus;
-use crate::surface::touchdown;
+use crate::surface::{top_m, touchdown};
+
+/// The way home is slow, because something may be held or in the way, and begins with a rise as high as the arm can.
+pub(crate) const HOME_SETTINGS: PrimitiveSettings = PrimitiveSettings {
+    travel_m_s: 0.25,
+    acceleration_m_s2: 0.5,
+    ..PrimitiveSettings::RIGID
+};
 
 /// A robot that is always where it was sent, and whose tool finds the table.
 struct DryRun {
@@ -134,6 +143,11 @@ pub(crate) struct RobotNow {
     pub observation_max_age: Duration,
     pub contact: Contact,
     pub sign: ContactSign,
+    pub checker: Arc<CollisionChecker>,
+    /// The newest heightmap that is sure not to show the arm.
+    pub without_arm: Option<Arc<Heightmap>>,
+    /// Where the last motion has picked.
+    pub picked: Option<Isometry2<f64>>,
 }
 
 impl RobotState for RobotNow {
@@ -163,9 +177,47 @@ impl RobotState for RobotNow {
         }
         self.dry_run(proposal).map(|_| ())
     }
+
+    fn plan_home(&self) -> Result<JointPositions, String> {
+        self.dry_run_home()?;
+        let joints = self.status.joints.as_ref();
+        let joints = joints.ok_or("the robot's state is not known")?;
+        Ok(joints.value.positions_rad)
+    }
 }
 
 impl RobotNow {
+    /// The way home from where the robot is, checked against the cell and against what stood on the table when the arm was last out of view;
+    /// else why it cannot be planned, or what it would hit.
+    pub fn dry_run_home(&self) -> Result<PlannedPrimitive, String> {
+        let (Some(joints), Some(pins)) = (&self.status.joints, &self.status.pins) else {
+            return Err("the robot's state is not known".into());
+        };
+        let joints = joints.value.positions_rad;
+        let mut robot = DryRun {
+            joints,
+            holds: pins.value.vacuum,
+            motion: PlannedPrimitive::default(),
+        };
+        let (arm, settings) = (&self.arm, &HOME_SETTINGS);
+        go_home(&mut robot, arm, settings).map_err(|error| one_line(&error.to_string()))?;
+        let lifted = self.lifted_out(pins.value.vacuum);
+        let (carried, heightmap) = match &lifted {
+            Some((carried, rest)) => (Some(*carried), Some(rest)),
+            None => (None, self.without_arm.as_deref()),
+        };
+        rehearse_home(&self.checker, arm, settings, &joints, carried, heightmap)
+            .map_err(|error| format!("the way home: {}", one_line(&error.to_string())))?;
+        Ok(robot.motion)
+    }
+
+    /// What the gripper holds, and the heightmap without it; nothing where it holds nothing, or nobody saw it.
+    fn lifted_out(&self, holds: bool) -> Option<(Carried, Heightmap)> {
+        let (heightmap, pick) = (self.without_arm.as_ref()?, self.picked.filter(|_| holds)?);
+        let top_m = top_m(heightmap, &Point2::from(pick.translation.vector))?;
+        lift_out(heightmap, &Arm::tip_down(&pick, top_m))
+    }
+
     /// The motion of a proposal from where the robot is; else why it cannot be planned.
     pub fn dry_run(&self, proposal: &Proposal) -> Result<PlannedPrimitive, String> {
         let (Some(joints), Some(pins)) = (&self.status.joints, &self.status.pins) else {
@@ -255,6 +307,9 @@ mod tests {
             observation_max_age: Duration::from_secs(10),
             contact: Contact::default(),
             sign: ContactSign::UntilAction,
+            checker: checker(),
+            without_arm: None,
+            picked: None,
         };
         assert_eq!(robot.obstacle(), None);
         robot.plan(&proposal(0.5)).unwrap();
@@ -343,5 +398,90 @@ mod tests {
         assert!(reason.contains("no heightmap"), "{reason}");
         robot.refused = Some("controller `x` is inactive".into());
         assert!(robot.obstacle().unwrap().contains("inactive"));
+    }
+
+    fn checker() -> Arc<CollisionChecker> {
+        let cell = WorkCell::builtin().unwrap();
+        Arc::new(CollisionChecker::new(&cell, collision::Margins::default()).unwrap())
+    }
+
+    /// A robot whose tip stands over (0.5, y) at a height.
+    fn robot_at(y_m: f64, height_m: f64) -> RobotNow {
+        let arm = WorkCell::builtin().unwrap().arm;
+        let over = Isometry2::new(Vector2::new(0.5, y_m), 0.0);
+        let mut status = ready(Duration::ZERO);
+        let joints = arm.solve(&Arm::tip_down(&over, height_m), &arm.ready);
+        status.joints.as_mut().unwrap().value.positions_rad = joints.unwrap();
+        RobotNow {
+            arm,
+            status,
+            now: Duration::ZERO,
+            max_age: Duration::from_secs(1),
+            unattended: None,
+            refused: None,
+            needs_home: false,
+            time: Duration::ZERO,
+            seen: None,
+            observation_max_age: Duration::from_secs(10),
+            contact: Contact::default(),
+            sign: ContactSign::UntilAction,
+            checker: checker(),
+            without_arm: None,
+            picked: None,
+        }
+    }
+
+    /// A table with a block of 40 mm, and 40 mm high, around (0.5, 0.1), and a wall of 0.5 m height at y = -0.2 m.
+    fn table_with_a_wall() -> Arc<Heightmap> {
+        let mut heightmap = Heightmap::new(heightmap::Workspace::RAVENS);
+        heightmap.rgb.fill(90);
+        let workspace = heightmap.workspace;
+        for row in 0..workspace.rows {
+            for col in 0..workspace.cols {
+                let center = workspace.center(heightmap::Pixel { row, col });
+                let height_m = &mut heightmap.height_m[row * workspace.cols + col];
+                if (center.coords - Vector2::new(0.5, 0.1)).amax() < 0.02 {
+                    *height_m = 0.04;
+                } else if (center.y + 0.2).abs() < 0.01 {
+                    *height_m = 0.5;
+                }
+            }
+        }
+        Arc::new(heightmap)
+    }
+
+    #[test]
+    fn the_way_home_is_planned_from_the_table_too_and_names_what_it_would_hit() {
+        let mut robot = robot_at(-0.35, 0.001);
+        let motion = robot.dry_run_home().unwrap();
+        let last = motion.points.last().unwrap().positions_rad;
+        assert!((last - robot.arm.home).amax() < 1e-6);
+        let from_rad = robot.plan_home().unwrap();
+        assert_eq!(from_rad, motion.points[0].positions_rad);
+        // Home lies on the other side of a wall that the cameras saw.
+        robot.without_arm = Some(table_with_a_wall());
+        let reason = robot.dry_run_home().unwrap_err();
+        assert!(
+            reason.contains("the way home") && reason.contains("the heightmap at"),
+            "{reason}"
+        );
+    }
+
+    #[test]
+    fn what_is_held_is_carried_home_and_not_hit_where_it_was_picked() {
+        let mut robot = robot_at(0.1, 0.04);
+        robot.without_arm = Some(table_with_a_wall());
+        robot.dry_run_home().unwrap();
+        robot.picked = Some(Isometry2::new(Vector2::new(0.5, 0.1), 0.0));
+        robot.status.pins.as_mut().unwrap().value.vacuum = true;
+        let (carried, rest) = robot.lifted_out(true).unwrap();
+        assert!((0.02..0.05).contains(&carried.radius_m()), "{carried:?}");
+        let index = |at: &Point2<f64>| {
+            let pixel = rest.workspace.pixel(at).unwrap();
+            pixel.row * rest.workspace.cols + pixel.col
+        };
+        assert_eq!(rest.height_m[index(&Point2::new(0.5, 0.1))], 0.0);
+        robot.dry_run_home().unwrap();
+        assert!(robot.lifted_out(false).is_none());
     }
 }

@@ -5,9 +5,9 @@
 
 mod driver;
 mod dry_run;
-mod home;
 mod node;
 mod parameters;
+mod planted;
 mod presence;
 pub mod status;
 mod stop_memory;

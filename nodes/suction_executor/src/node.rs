@@ -2,6 +2,8 @@
 
 mod action;
 mod motion;
+#[cfg(feature = "planted_faults")]
+mod planted;
 mod proposals;
 mod report;
 
@@ -10,12 +12,11 @@ use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use anyhow::Context as _;
+use collision::{CollisionChecker, Margins};
 use heightmap::{ChangeRules, Heightmap};
-use msgs::std_srvs::{Trigger, TriggerResponse};
 use msgs::{convert, sctn_msgs};
-use node_kit::{
-    ActionServer, Active, Node, Publisher, Qos, RequestId, ServiceServer, Subscription,
-};
+use nalgebra::Isometry2;
+use node_kit::{ActionServer, Active, Node, Publisher, Qos, ServiceServer, Subscription};
 use pick_place::Phase;
 use step_protocol::{ApprovalGate, GateRules, Proposal};
 use tokio::sync::{mpsc, watch};
@@ -24,7 +25,7 @@ use tracing::warn;
 use ur5::WorkCell;
 
 use self::action::{Goal, cancel_of};
-use self::motion::{Motion, end_of};
+use self::motion::{Motion, StopCause, end_of};
 use crate::driver::DriverClient;
 use crate::dry_run::RobotNow;
 use crate::parameters::SuctionExecutorParameters;
@@ -43,6 +44,7 @@ pub async fn configure(
     node: Node,
     parameters: SuctionExecutorParameters,
 ) -> anyhow::Result<ExecutorNode> {
+    crate::planted::check()?;
     let work_cell = match parameters.urdf.as_path() {
         path if path == Path::new("") => WorkCell::builtin(),
         path => WorkCell::load(path),
@@ -51,6 +53,12 @@ pub async fn configure(
     if let Some(warning) = work_cell.warning() {
         warn!("parameter urdf: {warning}");
     }
+    let margins = Margins {
+        obstacle_m: parameters.collision_margin_m,
+        ..Margins::default()
+    };
+    let checker =
+        CollisionChecker::new(&work_cell, margins).context("parameter collision_margin_m")?;
     let driver = DriverClient::new(&node, &parameters.driver, &work_cell)?;
     let mut gate = ApprovalGate::new(rules(&parameters));
     let stop_memory = StopMemory::new(parameters.stop_file.clone());
@@ -65,6 +73,7 @@ pub async fn configure(
         stop_memory,
         driver: Arc::new(driver),
         work_cell,
+        checker: Arc::new(checker),
     })
 }
 
@@ -89,6 +98,7 @@ pub struct ExecutorNode {
     stop_memory: StopMemory,
     driver: Arc<DriverClient>,
     work_cell: WorkCell,
+    checker: Arc<CollisionChecker>,
 }
 
 impl Active for ExecutorNode {
@@ -107,8 +117,7 @@ impl Active for ExecutorNode {
             results: &self.results,
             planned: &self.planned,
             unplanned: None,
-            home: node.service_server("~/home")?,
-            home_calls: Vec::new(),
+            home: node.service_server("~/propose_home")?,
             goals: node.action_server("execute_pick_place")?,
             goal: None,
             phase_sender,
@@ -116,11 +125,16 @@ impl Active for ExecutorNode {
             gate: &mut self.gate,
             stop_memory: self.stop_memory.clone(),
             seen: None,
+            without_arm: None,
+            picked: None,
+            #[cfg(feature = "planted_faults")]
+            planted: self::planted::Memory::default(),
             motion: None,
             driver: Arc::clone(&self.driver),
             node: node.clone(),
             parameters: parameters.borrow().clone(),
             work_cell: self.work_cell.clone(),
+            checker: Arc::clone(&self.checker),
             status: self.driver.status.clone(),
             origin: self.driver.origin,
         };
@@ -132,6 +146,7 @@ struct Executor<'a> {
     node: Node,
     parameters: SuctionExecutorParameters,
     work_cell: WorkCell,
+    checker: Arc<CollisionChecker>,
     proposals: Subscription<sctn_msgs::PickPlace>,
     confirmations: Subscription<sctn_msgs::StepConfirmation>,
     heightmaps: Subscription<sctn_msgs::Heightmap>,
@@ -141,9 +156,7 @@ struct Executor<'a> {
     planned: &'a Publisher<sctn_msgs::PlannedMotion>,
     /// The pending proposal, while its motion could not be planned.
     unplanned: Option<Proposal>,
-    home: ServiceServer<Trigger>,
-    /// Calls of `home` to be answered when the arm is there.
-    home_calls: Vec<RequestId>,
+    home: ServiceServer<sctn_msgs::ProposeHome>,
     goals: ActionServer<sctn_msgs::ExecutePickPlace>,
     goal: Option<Goal>,
     phase_sender: mpsc::UnboundedSender<Phase>,
@@ -153,10 +166,16 @@ struct Executor<'a> {
     stop_memory: StopMemory,
     /// The newest heightmap and its stamp.
     seen: Option<(Arc<Heightmap>, Duration)>,
+    /// The newest heightmap that is sure not to show the arm.
+    without_arm: Option<Arc<Heightmap>>,
+    /// Where the last motion has picked.
+    picked: Option<Isometry2<f64>>,
     motion: Option<Motion>,
     driver: Arc<DriverClient>,
     status: watch::Receiver<DriverStatus>,
     origin: Instant,
+    #[cfg(feature = "planted_faults")]
+    planted: self::planted::Memory,
 }
 
 impl Executor<'_> {
@@ -175,7 +194,7 @@ impl Executor<'_> {
                 message = self.confirmations.recv() => self.on_confirmation(message),
                 message = self.presences.recv() => self.on_presence(&message),
                 () = sleep_until(absence) => self.on_absence(),
-                (call, _) = self.home.recv() => self.on_home(call),
+                (call, _) = self.home.recv() => self.on_propose_home(call),
                 goal = self.goals.recv() => self.on_goal(goal),
                 () = cancel_of(&self.goal) => self.on_goal_cancel(),
                 Some(phase) = self.phases.recv() => self.say_phase(phase),
@@ -183,6 +202,8 @@ impl Executor<'_> {
                 () = sleep_until(deadline) => self.ask_again(),
                 _ = diagnostics.tick() => {
                     self.diagnose();
+                    #[cfg(feature = "planted_faults")]
+                    self.plant_now_and_then();
                     self.plan_again();
                 }
                 Ok(()) = changes.changed() => {
@@ -193,17 +214,14 @@ impl Executor<'_> {
             }
         }
         self.gate.deactivate();
-        for call in std::mem::take(&mut self.home_calls) {
-            let response = TriggerResponse {
-                success: false,
-                message: "the executor is deactivated".to_owned(),
-            };
-            self.home.respond(call, response);
-        }
         let deadline = tokio::time::Instant::now() + STOP_GRACE;
-        if let Some(motion) = &self.motion {
-            warn!("deactivated while moving: stopping");
-            motion.stop.cancel();
+        if let Some(motion) = &mut self.motion {
+            let cause = match node.is_ending() {
+                true => StopCause::Shutdown,
+                false => StopCause::Deactivated,
+            };
+            warn!("{} while moving", cause.text());
+            motion.stop(cause);
             let (cause, stopped, ended) = timeout_at(deadline, end_of(&mut self.motion))
                 .await
                 .with_context(|| format!("the arm has not stopped after {STOP_GRACE:?}"))?;
@@ -232,14 +250,14 @@ impl Executor<'_> {
     /// When a motion is to stop because nobody is present; never where that is not asked for.
     fn absence(&self) -> Option<Instant> {
         let motion = self.motion.as_ref()?;
-        let watched = self.parameters.require_presence && !motion.stop.is_cancelled();
+        let watched = self.parameters.require_presence && !motion.is_stopped();
         watched.then(|| self.presence.deadline().unwrap_or_else(Instant::now))
     }
 
     fn on_absence(&mut self) {
-        if let Some(motion) = &self.motion {
+        if let Some(motion) = &mut self.motion {
             warn!("no operator is present: stopping");
-            motion.stop.cancel();
+            motion.stop(StopCause::NobodyPresent);
         }
     }
 
@@ -261,6 +279,9 @@ impl Executor<'_> {
         match convert::observation_from_msg(message) {
             Ok(seen) => {
                 self.seen = Some((Arc::clone(&seen.heightmap), seen.stamp));
+                if !self.status.borrow().at_home.may_be_in_view(seen.stamp) {
+                    self.without_arm = Some(Arc::clone(&seen.heightmap));
+                }
                 self.gate.on_heightmap(seen.stamp, seen.heightmap);
                 self.plan_again();
                 self.ask_again();
@@ -283,6 +304,9 @@ impl Executor<'_> {
             observation_max_age: Duration::from_secs_f64(self.parameters.observation_max_age_s),
             contact: self.parameters.contact,
             sign: self.parameters.driver.contact,
+            checker: Arc::clone(&self.checker),
+            without_arm: self.without_arm.clone(),
+            picked: self.picked,
         }
     }
 }

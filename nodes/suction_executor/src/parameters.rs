@@ -35,6 +35,8 @@ pub struct SuctionExecutorParameters {
     pub observation_max_age_s: f64,
     /// Whether heightmaps count only where the arm was at home and at rest when they were taken.
     pub observation_needs_home: bool,
+    /// Distance that the way home keeps from the cell and from what was seen (m).
+    pub collision_margin_m: f64,
     /// Wall seconds that a confirmation waits for its proposal and heightmap.
     pub confirmation_grace_s: f64,
     /// How the tip comes down.
@@ -178,6 +180,7 @@ impl Default for SuctionExecutorParameters {
             observation_changed_area_mm2: 75.0,
             observation_max_age_s: 5.0,
             observation_needs_home: false,
+            collision_margin_m: 0.01,
             confirmation_grace_s: 0.5,
             contact: Contact::default(),
             driver: Driver::default(),
@@ -270,6 +273,7 @@ impl Parameters for SuctionExecutorParameters {
         ("limits.acceleration_m_s2", Range::POSITIVE),
         ("observation_tolerance_m", Range::POSITIVE),
         ("observation_changed_area_mm2", Range::POSITIVE),
+        ("collision_margin_m", Range::Float(0.0, 0.2)),
         ("sure_probability", Range::SHARE),
         ("presence_timeout_s", Range::POSITIVE),
         ("observation_max_age_s", TIME),

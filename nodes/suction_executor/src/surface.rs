@@ -57,6 +57,11 @@ pub(crate) fn touchdown(
     }))
 }
 
+/// The height of what the cup meets at a point (m); nothing where none was seen.
+pub(crate) fn top_m(heightmap: &Heightmap, at: &Point2<f64>) -> Option<f64> {
+    quantile_m(heightmap, at, CUP_RADIUS_M, TOP)
+}
+
 /// The height that a share of the cells around a point do not exceed (m); nothing where none was seen.
 fn quantile_m(
     heightmap: &Heightmap,

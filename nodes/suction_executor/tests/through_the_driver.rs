@@ -8,9 +8,10 @@ use std::time::{Duration, Instant};
 use heightmap::{Camera, Fusion, Heightmap, View, Workspace};
 use msgs::convert;
 use msgs::diagnostic_msgs::DiagnosticArray;
-use msgs::sctn_msgs::{self, OperatorPresence, Reward, StepConfirmation, StepResult};
+use msgs::sctn_msgs::{
+    self, OperatorPresence, ProposeHome, ProposeHomeRequest, Reward, StepConfirmation, StepResult,
+};
 use msgs::sensor_msgs::{CameraInfo, Image, JointState};
-use msgs::std_srvs::{Trigger, TriggerRequest};
 use msgs::tf2_msgs::TFMessage;
 use msgs::ur_dashboard_msgs::SafetyMode;
 use multiravens::{Environment, Problem};
@@ -445,10 +446,10 @@ async fn a_stop_stops_the_arm_and_it_goes_on_neither_by_itself_nor_on_the_old_ap
     );
     tokio::time::sleep(Duration::from_secs(1)).await;
     assert_eq!(bench.joints().await.position, stopped.position);
-    // Called home, it can see and be told again.
+    // Called home, it can see and be told again. The call alone moves nothing.
     let home_service = bench
         .node
-        .service_client::<Trigger>("/suction_executor/home")
+        .service_client::<ProposeHome>("/suction_executor/propose_home")
         .unwrap();
     home_service.wait_for_server(PATIENCE).await.unwrap();
     // A call may be lost while the two ends are still discovering each other.
@@ -456,11 +457,20 @@ async fn a_stop_stops_the_arm_and_it_goes_on_neither_by_itself_nor_on_the_old_ap
         attempts: 12,
         timeout: PATIENCE / 12,
     };
-    let response = home_service
-        .call(&TriggerRequest::default(), &patient)
-        .await
-        .unwrap();
-    assert!(response.success, "{}", response.message);
+    let call = ProposeHomeRequest::default();
+    let proposed = home_service.call(&call, &patient).await.unwrap();
+    assert!(
+        proposed.success && proposed.needs_approval,
+        "{}",
+        proposed.message
+    );
+    let again = home_service.call(&call, &patient).await.unwrap();
+    assert_eq!(again.proposal_id, proposed.proposal_id);
+    bench.decide(1, StepConfirmation::APPROVE);
+    bench.ended(1, StepResult::REFUSED).await;
+    assert_eq!(bench.joints().await.position, stopped.position);
+    bench.decide(proposed.proposal_id, StepConfirmation::APPROVE);
+    bench.ended(proposed.proposal_id, StepResult::AT_HOME).await;
     let at_home = bench.joints().await;
     assert_eq!(
         convert::joints_from_msg(&at_home, &environment.cell().work_cell().joint_names).unwrap(),

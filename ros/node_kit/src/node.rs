@@ -314,6 +314,11 @@ impl Node {
         self.inner.end.cancel();
     }
 
+    /// Whether the node, and with it the process, is to end.
+    pub fn is_ending(&self) -> bool {
+        self.inner.end.is_cancelled()
+    }
+
     /// Cancelled when the node is to end.
     pub(crate) fn end(&self) -> &CancellationToken {
         &self.inner.end

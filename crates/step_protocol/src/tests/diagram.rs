@@ -111,7 +111,10 @@ fn tracker_table() -> String {
         );
     }
     table += "\n|---|---|---|---|---|\n";
-    for outcome in StepOutcome::ALL {
+    for outcome in StepOutcome::ALL
+        .into_iter()
+        .filter(|outcome| !outcome.is_of_home())
+    {
         let _ = write!(table, "| `{outcome:?}` |");
         for decision in decisions {
             let _ = write!(table, " {} |", goal_after(outcome, decision));

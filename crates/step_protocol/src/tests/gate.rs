@@ -8,8 +8,8 @@ use nalgebra::{Isometry2, Vector2};
 use pick_place::{PickPlace, PrimitiveSettings};
 
 use crate::{
-    ApprovalGate, GateAction, GateRules, OperatorDecision, Proposal, ProposalId, ProposalStatus,
-    Proposed, RequireApproval, RobotState, StepOutcome,
+    ApprovalGate, GateAction, GateRules, JointPositions, OperatorDecision, Proposal, ProposalId,
+    ProposalStatus, Proposed, RequireApproval, RobotState, StepOutcome,
 };
 
 pub(super) const NOW: Duration = Duration::from_secs(100);
@@ -66,6 +66,8 @@ pub(super) fn proposal(id: u64) -> Proposal {
 pub(super) struct Robot {
     obstacle: Option<&'static str>,
     no_plan: Option<&'static str>,
+    /// Where every joint is (rad).
+    joints_rad: f64,
 }
 
 impl RobotState for Robot {
@@ -76,11 +78,19 @@ impl RobotState for Robot {
     fn plan(&self, _: &Proposal) -> Result<(), String> {
         self.no_plan.map_or(Ok(()), |reason| Err(reason.to_owned()))
     }
+
+    fn plan_home(&self) -> Result<JointPositions, String> {
+        match self.no_plan {
+            Some(reason) => Err(reason.to_owned()),
+            None => Ok(JointPositions::repeat(self.joints_rad)),
+        }
+    }
 }
 
 pub(super) const READY: Robot = Robot {
     obstacle: None,
     no_plan: None,
+    joints_rad: 0.0,
 };
 
 fn empty() -> Arc<Heightmap> {
@@ -585,31 +595,104 @@ fn a_withdrawn_proposal_cannot_be_approved_and_says_so() {
 }
 
 #[test]
-fn the_arm_goes_home_at_a_call_when_nothing_else_moves() {
+fn the_arm_goes_home_only_by_an_approval_of_that_very_proposal() {
     let mut gate = gate();
     let stopped = Robot {
         obstacle: Some("PROTECTIVE_STOP"),
         ..Robot::default()
     };
-    let reason = gate.go_home(&stopped).unwrap_err();
+    let propose_home = |gate: &mut ApprovalGate, id, robot: &Robot| {
+        let proposed = gate.propose_home(ProposalId(id), robot);
+        proposed.map(|ProposalId(id)| id)
+    };
+    let reason = propose_home(&mut gate, 50, &stopped).unwrap_err();
     assert!(reason.contains("PROTECTIVE_STOP"), "{reason}");
-    gate.go_home(&READY).unwrap();
-    let actions = approve(&mut gate, 7);
-    assert_refused(&gate, actions, &["7", "on its way home"]);
+    assert_eq!(propose_home(&mut gate, 50, &READY), Ok(50));
+    // The call may come again because its answer was lost.
+    assert_eq!(propose_home(&mut gate, 51, &READY), Ok(50));
+    assert!(!gate.moves_unasked(ProposalId(50)));
+    let elsewhere = Robot {
+        joints_rad: 0.1,
+        ..Robot::default()
+    };
+    let actions = gate.on_confirmation(ProposalId(50), OperatorDecision::Approve, &elsewhere, NOW);
+    assert_refused(&gate, actions, &["50", "has moved since"]);
+    let actions = approve(&mut gate, 50);
+    assert_refused(&gate, actions, &["50", "withdrawn"]);
+    assert_eq!(propose_home(&mut gate, 52, &READY), Ok(52));
+    // A newer proposal does not supersede it.
+    propose(&mut gate, proposal(8));
+    assert_eq!(approve(&mut gate, 52), [GateAction::GoHome(ProposalId(52))]);
+    assert!(propose_home(&mut gate, 53, &READY).is_err());
+    let actions = approve(&mut gate, 8);
+    assert_refused(&gate, actions, &["8", "on its way home"]);
     let actions = decide(&mut gate, 99, OperatorDecision::Stop);
     assert_eq!(actions, [GateAction::Cancel]);
     gate.finish(Duration::from_secs(9), false);
+    let actions = approve(&mut gate, 52);
+    assert_refused(&gate, actions, &["52", "already carried out"]);
     // The stop has withdrawn what was proposed, and the old observation is none any more.
-    propose(&mut gate, proposal(8));
-    let actions = approve(&mut gate, 8);
-    assert_refused(&gate, actions, &["8", "9.000 s"]);
+    propose(&mut gate, proposal(80));
+    let actions = approve(&mut gate, 80);
+    assert_refused(&gate, actions, &["80", "9.000 s"]);
     gate.on_heightmap(Duration::from_secs(9), empty());
     let mut fresh = proposal(9);
     fresh.stamp = Duration::from_secs(9);
     propose(&mut gate, fresh);
+    assert_eq!(propose_home(&mut gate, 54, &READY), Ok(54));
     assert!(matches!(approve(&mut gate, 9)[..], [GateAction::Move(_)]));
-    let reason = gate.go_home(&READY).unwrap_err();
+    let reason = propose_home(&mut gate, 55, &READY).unwrap_err();
     assert!(reason.contains("proposal 9"), "{reason}");
+    gate.finish(Duration::from_secs(10), false);
+    // The motion has withdrawn it.
+    let actions = approve(&mut gate, 54);
+    assert_refused(&gate, actions, &["54", "withdrawn"]);
+}
+
+#[test]
+fn a_stop_a_rejection_and_a_deactivation_withdraw_the_way_home() {
+    for (decision, outcome) in [
+        (OperatorDecision::Stop, StepOutcome::Stopped),
+        (OperatorDecision::Reject, StepOutcome::Rejected),
+    ] {
+        let mut gate = gate();
+        gate.propose_home(ProposalId(50), &READY).unwrap();
+        let actions = decide(&mut gate, 50, decision);
+        assert!(
+            matches!(&actions[..], [GateAction::Report(report)] if report.outcome == outcome),
+            "{actions:?}"
+        );
+        let actions = approve(&mut gate, 50);
+        assert_refused(&gate, actions, &["50", "was"]);
+    }
+    let mut gate = gate();
+    gate.propose_home(ProposalId(50), &READY).unwrap();
+    gate.deactivate();
+    let actions = approve(&mut gate, 50);
+    assert_refused(&gate, actions, &["50", "withdrawn"]);
+}
+
+#[test]
+fn the_way_home_moves_unasked_only_where_nothing_needs_an_approval_and_nothing_was_stopped() {
+    for (require_approval, moves) in [
+        (RequireApproval::Always, false),
+        (RequireApproval::Unsure { threshold: 0.0 }, false),
+        (RequireApproval::Never, true),
+    ] {
+        let mut gate = ApprovalGate::new(GateRules {
+            require_approval,
+            ..rules()
+        });
+        let id = ProposalId(50);
+        gate.propose_home(id, &READY).unwrap();
+        assert_eq!(gate.moves_unasked(id), moves);
+        gate.remember_stop();
+        assert!(!gate.moves_unasked(id));
+        // The way home is no reason for other motions to go on by themselves.
+        approve(&mut gate, 50);
+        gate.finish(NOW, false);
+        assert!(!gate.is_automatic());
+    }
 }
 
 #[test]

@@ -17,9 +17,10 @@ use rand_chacha::ChaCha8Rng;
 use crate::mutation::{Mutation, plant};
 use crate::{
     ApprovalGate, Change, Confirmation, Coverage, GateAction, GateRules, Goal, GoalSequence,
-    GoalTracker, Job, Judgement, Observation, Operator, OperatorDecision, PlannerRules, Prediction,
-    Proposal, ProposalId, ProposalPlanner, ProposalStatus, Proposed, Question, RequireApproval,
-    Reward, RobotState, ShownStep, StepJudge, StepOutcome, StepResult, goals_of,
+    GoalTracker, Job, JointPositions, Judgement, Observation, Operator, OperatorDecision,
+    PlannerRules, Prediction, Proposal, ProposalId, ProposalPlanner, ProposalStatus, Proposed,
+    Question, RequireApproval, Reward, RobotState, ShownStep, StepJudge, StepOutcome, StepResult,
+    goals_of,
 };
 
 const WORKSPACE: Workspace = Workspace {
@@ -98,7 +99,7 @@ enum Action {
     SetStep(usize),
     /// The robot is ready or not.
     Obstacle(bool),
-    /// Somebody calls the arm home.
+    /// Somebody calls for the way home.
     Home,
 }
 
@@ -124,8 +125,7 @@ impl Action {
             94..96 => Self::Tick,
             96 => Self::SetStep(which),
             97 => Self::Obstacle(which % 3 == 0),
-            98 => Self::Home,
-            _ => Self::Observe(1),
+            _ => Self::Home,
         }
     }
 }
@@ -148,6 +148,8 @@ fn violation<T>(text: impl Into<String>) -> Result<T, Violation> {
 
 struct Robot {
     ready: bool,
+    /// Where the arm is: 0 at home, where motions begin and end, something else where one was broken off.
+    joints: u32,
 }
 
 impl RobotState for Robot {
@@ -158,13 +160,17 @@ impl RobotState for Robot {
     fn plan(&self, _: &Proposal) -> Result<(), String> {
         Ok(())
     }
+
+    fn plan_home(&self) -> Result<JointPositions, String> {
+        Ok(JointPositions::repeat(f64::from(self.joints)))
+    }
 }
 
 /// What moves the arm.
 #[derive(Clone, Debug, PartialEq)]
 enum Motion {
     Proposal(Box<Proposal>),
-    Home,
+    Home(ProposalId),
 }
 
 /// The whole graph, and what is known of it from outside.
@@ -186,6 +192,10 @@ struct World {
     latched_proposals: [Option<Proposal>; 2],
     motion: Option<Motion>,
     cancelled: bool,
+    /// The way home that may be approved: the newest, until a stop, a motion, a deactivation or a restart.
+    home: Option<ProposalId>,
+    /// Every way home that was proposed.
+    homes: Vec<ProposalId>,
     /// Everything that was published under an id.
     published: BTreeMap<ProposalId, Vec<Proposal>>,
     foreign_count: u64,
@@ -276,7 +286,10 @@ impl World {
             operators: [Operator::new(true), Operator::new(true)],
             inboxes: Default::default(),
             job: None,
-            robot: Robot { ready: true },
+            robot: Robot {
+                ready: true,
+                joints: 0,
+            },
             now: Duration::ZERO,
             clock_runs,
             seen: Observation {
@@ -289,6 +302,8 @@ impl World {
             latched_proposals: [None, None],
             motion: None,
             cancelled: false,
+            home: None,
+            homes: Vec::new(),
             published: BTreeMap::new(),
             foreign_count: 0,
             moved: BTreeSet::new(),
@@ -383,7 +398,9 @@ impl World {
                 self.gate = gate();
                 self.approvals.clear();
                 self.newest_at_gate = None;
+                self.home = None;
                 if self.motion.take().is_some() {
+                    self.robot.joints += 1;
                     self.move_scene(0.0);
                 }
             }
@@ -640,7 +657,13 @@ impl World {
                 let id = confirmation.proposal_id;
                 match confirmation.decision {
                     OperatorDecision::Approve => self.approvals.push(id),
-                    OperatorDecision::Stop => self.approvals.clear(),
+                    OperatorDecision::Stop => {
+                        self.approvals.clear();
+                        self.home = None;
+                    }
+                    OperatorDecision::Reject => {
+                        self.home.take_if(|home| *home == id);
+                    }
                     _ => {}
                 }
                 let decision = confirmation.decision;
@@ -675,8 +698,24 @@ impl World {
                         return violation(format!("{id} moves otherwise than it was published"));
                     }
                     self.moved.insert(id);
+                    self.home = None;
                     self.cancelled = false;
                     self.motion = Some(Motion::Proposal(proposal));
+                }
+                GateAction::GoHome(id) => {
+                    if self.motion.is_some() {
+                        return violation(format!("{id} moves the arm home while it moves"));
+                    }
+                    let approval = self.approvals.iter().position(|approved| *approved == id);
+                    match approval {
+                        Some(index) => drop(self.approvals.swap_remove(index)),
+                        None => return violation(format!("{id} moves home without an approval")),
+                    }
+                    if self.home.take() != Some(id) {
+                        return violation(format!("{id} moves home after it was withdrawn"));
+                    }
+                    self.cancelled = false;
+                    self.motion = Some(Motion::Home(id));
                 }
                 GateAction::Cancel => {
                     if self.motion.is_none() {
@@ -728,9 +767,26 @@ impl World {
         let broken_off = matches!(outcome, StepOutcome::Stopped | StepOutcome::Fault);
         if broken_off {
             self.approvals.clear();
+            self.robot.joints += 1;
+        } else {
+            self.robot.joints = 0;
         }
         let actions = self.gate.finish(end, broken_off);
-        if let Motion::Proposal(proposal) = motion {
+        if let Motion::Home(id) = motion {
+            let outcome = match broken_off {
+                true => StepOutcome::NotHome,
+                false => StepOutcome::AtHome,
+            };
+            let status = self.gate.status(id);
+            self.publish(Message::Result(StepResult {
+                stamp: end,
+                proposal_id: id,
+                outcome,
+                reason: String::new(),
+                duration: Duration::from_secs(1),
+                status,
+            }));
+        } else if let Motion::Proposal(proposal) = motion {
             let status = self.gate.status(proposal.id);
             self.publish(Message::Result(StepResult {
                 stamp: end,
@@ -848,6 +904,7 @@ impl World {
             Action::Deactivate => {
                 self.gate.deactivate();
                 self.approvals.clear();
+                self.home = None;
                 if self.motion.is_some() {
                     self.cancelled = true;
                     self.end_motion(StepOutcome::Stopped, 0.0)?;
@@ -885,6 +942,9 @@ impl World {
                 let unknown = ProposalId(which as u64);
                 let count = self.published.len() + 1;
                 let id = self.published.keys().rev().nth(which % count).copied();
+                // Of a way home, as often as of another one.
+                let home = self.homes.iter().rev().nth(which / 2 % 2).copied();
+                let id = home.filter(|_| which % 2 == 0).or(id);
                 let decision = OperatorDecision::ALL[decision % 6];
                 self.confirm(number % 2, id.unwrap_or(unknown), decision);
             }
@@ -900,9 +960,25 @@ impl World {
             }
             Action::Obstacle(obstacle) => self.robot.ready = !obstacle,
             Action::Home => {
-                if self.motion.is_none() && self.gate.go_home(&self.robot).is_ok() {
-                    self.cancelled = false;
-                    self.motion = Some(Motion::Home);
+                let new = ProposalId(1_000_000 + self.homes.len() as u64);
+                let Ok(id) = self.gate.propose_home(new, &self.robot) else {
+                    return Ok(());
+                };
+                if self.motion.is_some() {
+                    return violation(format!("{id} is proposed while the arm moves"));
+                }
+                if id == new {
+                    self.homes.push(id);
+                    self.home = Some(id);
+                } else if self.home != Some(id) {
+                    return violation(format!("{id} is proposed again after it was withdrawn"));
+                }
+                if self.gate.moves_unasked(id) {
+                    let approve = OperatorDecision::Approve;
+                    let actions = self
+                        .gate
+                        .on_confirmation(id, approve, &self.robot, self.now);
+                    return self.act(actions);
                 }
             }
         }

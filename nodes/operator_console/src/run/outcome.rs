@@ -7,7 +7,7 @@ use msgs::sctn_msgs::{ConfirmationRefused, StepConfirmation, StepResult};
 use step_protocol::{ProposalStatus, StepOutcome};
 
 use super::{Decision, InvalidMessage, PastStep, Run, STEPS, Status, duration};
-use crate::refusal::{advice_for, advice_of_oracle};
+use crate::refusal::{advice, advice_for, advice_of_oracle};
 
 impl Run {
     /// An operator has decided, here or elsewhere.
@@ -94,6 +94,15 @@ impl Run {
                 "Look at the cell. When it is safe, bring the arm home, then try the step again.",
                 now,
             ),
+            StepOutcome::AtHome => {
+                self.note("note", "The arm is at home.", "", now);
+                return Ok(());
+            }
+            StepOutcome::NotHome => {
+                let text = format!("The arm did not go home: {}", result.reason);
+                self.note("refusal", text, advice(&result.reason), now);
+                return Ok(());
+            }
             StepOutcome::Placed
             | StepOutcome::NoContact
             | StepOutcome::GraspFailed
@@ -167,6 +176,8 @@ pub(crate) fn outcome_words(outcome: StepOutcome) -> &'static str {
         StepOutcome::LagAborted => "stopped: the arm lagged behind",
         StepOutcome::Fault => "broke off by a fault",
         StepOutcome::Stopped => "stopped by the operator",
+        StepOutcome::AtHome => "at home",
+        StepOutcome::NotHome => "not at home",
         StepOutcome::Refused => "refused",
         StepOutcome::Rejected => "rejected",
     }

@@ -7,6 +7,8 @@ use node_kit::{Node, Publisher, Qos, TaskGroup};
 use tokio::sync::watch;
 use tokio::time::timeout;
 
+use crate::planted::{Planted, is_planted};
+
 /// Topic of the heartbeat: whether a motion is under way.
 const TOPIC: &str = "motion_heartbeat";
 /// How often the watchdog hears that a motion is under way.
@@ -92,7 +94,7 @@ impl Heartbeat {
                 heartbeats.recv().await;
             }
         };
-        if timeout(LISTENING, listening).await.is_ok() {
+        if timeout(LISTENING, listening).await.is_ok() && !is_planted(Planted::SecondExecutor) {
             anyhow::bail!(
                 "another executor is active: its heartbeat is on {TOPIC}, expected one executor for each arm"
             );
@@ -112,7 +114,7 @@ async fn beat(
         let Beating { active, moving } = *beating.borrow_and_update();
         let is_moving = moving > 0;
         // Once more after the last motion.
-        if is_moving || active || !silent {
+        if (is_moving || active || !silent) && !is_planted(Planted::NoHeartbeat) {
             heartbeats.publish(Bool { data: is_moving });
         }
         saying.send_replace(is_moving);

@@ -8,7 +8,7 @@ use step_protocol::{OperatorDecision, ProposalId, Proposed, Report, StepOutcome}
 use tracing::info;
 
 use super::Executor;
-use super::motion::Cause;
+use super::motion::{Cause, StopCause};
 use super::proposals::read_proposal;
 
 /// A goal of the action, from its acceptance to its end.
@@ -28,7 +28,7 @@ impl Executor<'_> {
             (Some(goal), _) => Some(format!("a goal for proposal {} is active", goal.id)),
             (None, Some(motion)) => Some(match motion.cause {
                 Cause::Proposal(moving) => format!("proposal {moving} is being carried out"),
-                Cause::Home => "the arm is on its way home".to_owned(),
+                Cause::Home(_) => "the arm is on its way home".to_owned(),
             }),
             (None, None) => None,
         };
@@ -78,8 +78,8 @@ impl Executor<'_> {
         goal.cancelling = true;
         let (id, moving) = (goal.id, goal.moving);
         info!("proposal {id}: its goal is cancelled");
-        match &self.motion {
-            Some(motion) if moving => motion.stop.cancel(),
+        match &mut self.motion {
+            Some(motion) if moving => motion.stop(StopCause::GoalCancelled),
             _ => {
                 self.gate.withdraw(id);
                 let reason = "the goal was cancelled; nothing was moving".to_owned();

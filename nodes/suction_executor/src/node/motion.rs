@@ -1,13 +1,14 @@
 //! Motions: their start, their end, and what is said of it.
 
+use std::hash::{DefaultHasher, Hash as _, Hasher as _};
 use std::sync::Arc;
 use std::time::Duration;
 
 use anyhow::Context as _;
-use msgs::std_srvs::TriggerResponse;
+use msgs::sctn_msgs::ProposeHomeResponse;
 use node_kit::{Level, RequestId};
-use pick_place::{ExecuteError, Outcome, Phase};
-use step_protocol::{Proposal, ProposalId, Report, StepOutcome};
+use pick_place::{ExecuteError, Outcome, Phase, go_home};
+use step_protocol::{OperatorDecision, Proposal, ProposalId, Report, StepOutcome};
 use tokio::runtime::Handle;
 use tokio::task::JoinHandle;
 use tokio_util::sync::CancellationToken;
@@ -15,26 +16,59 @@ use tracing::{info, warn};
 
 use super::Executor;
 use crate::driver::{DriverError, DriverRobot};
-use crate::home::go_home;
+use crate::dry_run::HOME_SETTINGS;
+use crate::planted::{Planted, is_planted};
 use crate::surface::touchdown;
-
-/// Calls of `home` that are answered when the arm is there; more fail at once.
-const WAITING_CALLS: usize = 16;
 
 /// What moves the arm.
 #[derive(Clone, Copy, PartialEq, Eq)]
 pub(super) enum Cause {
     /// An approved proposal.
     Proposal(ProposalId),
-    /// A call of the service `home`.
-    Home,
+    /// An approved way home.
+    Home(ProposalId),
+}
+
+/// Why a motion is stopped.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(super) enum StopCause {
+    Operator,
+    GoalCancelled,
+    NobodyPresent,
+    Deactivated,
+    Shutdown,
+}
+
+impl StopCause {
+    pub(super) const fn text(self) -> &'static str {
+        match self {
+            Self::Operator => "stopped by the operator",
+            Self::GoalCancelled => "stopped because its goal was cancelled",
+            Self::NobodyPresent => "stopped because no operator is present",
+            Self::Deactivated => "stopped because the executor was deactivated",
+            Self::Shutdown => "stopped because the executor was told to end",
+        }
+    }
 }
 
 /// A primitive, or the way home, under way.
 pub(super) struct Motion {
     pub(super) cause: Cause,
-    pub(super) stop: CancellationToken,
-    pub(super) task: JoinHandle<Ended>,
+    stop: CancellationToken,
+    /// What has stopped it first.
+    stopped: Option<StopCause>,
+    task: JoinHandle<Ended>,
+}
+
+impl Motion {
+    pub(super) fn stop(&mut self, cause: StopCause) {
+        self.stopped.get_or_insert(cause);
+        self.stop.cancel();
+    }
+
+    pub(super) fn is_stopped(&self) -> bool {
+        self.stopped.is_some()
+    }
 }
 
 /// How a motion ended.
@@ -64,6 +98,7 @@ impl Executor<'_> {
             // The receiver lives as long as the node.
             let _ = phases.send(phase);
         };
+        self.picked = Some(proposal.action.pick);
         self.start(Cause::Proposal(id), move |robot| {
             let Proposal {
                 action, settings, ..
@@ -82,43 +117,57 @@ impl Executor<'_> {
         });
     }
 
-    /// Brings the arm home, for after a stop or a fault. The call may come again because its
-    /// answer was lost.
-    pub(super) fn on_home(&mut self, call: RequestId) {
-        let at_work = self
-            .motion
-            .as_ref()
-            .is_some_and(|motion| motion.cause == Cause::Home);
-        if !at_work {
-            if let Err(reason) = self.gate.go_home(&self.robot()) {
-                warn!("home: {reason}");
-                self.home.respond(
-                    call,
-                    TriggerResponse {
-                        success: false,
-                        message: reason,
-                    },
-                );
-                return;
+    /// Proposes the way home, for after a stop or a fault. The call may come again because its answer was lost.
+    pub(super) fn on_propose_home(&mut self, call: RequestId) {
+        let robot = self.robot();
+        let id = self.home_id();
+        let answer = match self.gate.propose_home(id, &robot) {
+            Ok(id) => {
+                info!("proposal {id}: the way home");
+                self.publish_plan(robot.dry_run_home(), id);
+                let unasked = self.gate.moves_unasked(id) || is_planted(Planted::HomeUnasked);
+                if unasked {
+                    self.confirm(id, OperatorDecision::Approve);
+                }
+                ProposeHomeResponse {
+                    success: true,
+                    message: String::new(),
+                    proposal_id: id.0,
+                    needs_approval: !unasked,
+                }
             }
-            info!("home: moving");
-            let arm = self.work_cell.arm.clone();
-            self.start(Cause::Home, move |robot| {
-                go_home(robot, &arm).map(|()| None)
-            });
-        }
-        if self.home_calls.len() < WAITING_CALLS {
-            self.home_calls.push(call);
-        } else {
-            let message = format!("{WAITING_CALLS} other calls wait");
-            self.home.respond(
-                call,
-                TriggerResponse {
+            Err(reason) => {
+                warn!("home: {reason}");
+                ProposeHomeResponse {
                     success: false,
-                    message,
-                },
-            );
+                    message: reason,
+                    ..Default::default()
+                }
+            }
+        };
+        self.home.respond(call, answer);
+    }
+
+    /// An id for a way home: of the present time and place.
+    fn home_id(&self) -> ProposalId {
+        let mut hash = DefaultHasher::new();
+        self.node.clock().now_ns().hash(&mut hash);
+        self.origin.elapsed().hash(&mut hash);
+        if let Some(joints) = &self.status.borrow().joints {
+            for position_rad in &joints.value.positions_rad {
+                position_rad.to_bits().hash(&mut hash);
+            }
         }
+        ProposalId(hash.finish())
+    }
+
+    /// Brings the arm home, straight up first; suction stays as it is.
+    pub(super) fn begin_home(&mut self, id: ProposalId) {
+        info!("proposal {id}: moving home");
+        let arm = self.work_cell.arm.clone();
+        self.start(Cause::Home(id), move |robot| {
+            go_home(robot, &arm, &HOME_SETTINGS).map(|()| None)
+        });
     }
 
     /// Moves the arm on a thread of its own.
@@ -135,10 +184,20 @@ impl Executor<'_> {
             result: work(&mut robot),
             stamps: robot.stamps,
         });
-        self.motion = Some(Motion { cause, stop, task });
+        self.motion = Some(Motion {
+            cause,
+            stop,
+            stopped: None,
+            task,
+        });
     }
 
-    pub(super) fn on_end(&mut self, cause: Cause, stopped: bool, ended: anyhow::Result<Ended>) {
+    pub(super) fn on_end(
+        &mut self,
+        cause: Cause,
+        stopped: Option<StopCause>,
+        ended: anyhow::Result<Ended>,
+    ) {
         while let Ok(phase) = self.phases.try_recv() {
             self.say_phase(phase);
         }
@@ -148,13 +207,13 @@ impl Executor<'_> {
         };
         let (outcome, mut reason) = match result {
             Ok(Ok(Some(outcome))) => (StepOutcome::from(outcome), why(outcome).to_owned()),
-            Ok(Ok(None)) => (StepOutcome::Placed, "at home".to_owned()),
+            Ok(Ok(None)) => (StepOutcome::AtHome, String::new()),
             Ok(Err(ExecuteError::Robot {
                 phase,
                 error: DriverError::Stopped,
             })) => (
                 StepOutcome::Stopped,
-                format!("{phase:?}: {}", DriverError::Stopped),
+                format!("{phase:?}: {}", stopped.map_or("stopped", StopCause::text)),
             ),
             Ok(Err(error)) => (StepOutcome::Fault, one_line(&error.to_string())),
             Err(error) => (StepOutcome::Fault, format!("{error:#}")),
@@ -163,7 +222,7 @@ impl Executor<'_> {
         if broken_off {
             self.stop_memory.remember(&reason);
             reason += "; the arm stands where it is, suction is as it was; a new observation and approval are needed";
-        } else if stopped {
+        } else if stopped.is_some() {
             reason = format!("the stop came after the end. {reason}")
                 .trim()
                 .to_owned();
@@ -179,39 +238,34 @@ impl Executor<'_> {
         let end = stamps.map_or(now, |(_, last)| last.max(now));
         let duration = stamps.map_or(Duration::ZERO, |(first, last)| last - first.min(last));
         let actions = self.gate.finish(end, broken_off);
-        match cause {
-            Cause::Proposal(id) => {
-                let report = Report {
-                    id,
-                    outcome,
-                    reason,
-                    status: self.gate.status(id),
-                };
-                self.report(report, Some((end, duration)));
-            }
-            Cause::Home => {
-                info!("home: {reason}");
-                for call in std::mem::take(&mut self.home_calls) {
-                    let response = TriggerResponse {
-                        success: !broken_off,
-                        message: reason.clone(),
-                    };
-                    self.home.respond(call, response);
-                }
-            }
-        }
+        let (id, outcome) = match cause {
+            Cause::Proposal(id) => (id, outcome),
+            Cause::Home(id) if broken_off => (id, StepOutcome::NotHome),
+            Cause::Home(id) => (id, StepOutcome::AtHome),
+        };
+        let report = Report {
+            id,
+            outcome,
+            reason,
+            status: self.gate.status(id),
+        };
+        self.report(report, Some((end, duration)));
+        #[cfg(feature = "planted_faults")]
+        self.plant_at_end(outcome);
         self.act(actions);
         self.ask_again();
     }
 }
 
 /// Waits for the end of a motion, and takes it; for ever when there is none.
-pub(super) async fn end_of(motion: &mut Option<Motion>) -> (Cause, bool, anyhow::Result<Ended>) {
+pub(super) async fn end_of(
+    motion: &mut Option<Motion>,
+) -> (Cause, Option<StopCause>, anyhow::Result<Ended>) {
     match motion {
         Some(running) => {
             let ended = (&mut running.task).await;
             let ended = ended.context("the motion's thread panicked");
-            let (cause, stopped) = (running.cause, running.stop.is_cancelled());
+            let (cause, stopped) = (running.cause, running.stopped);
             *motion = None;
             (cause, stopped, ended)
         }

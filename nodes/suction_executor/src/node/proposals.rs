@@ -5,6 +5,7 @@ use step_protocol::{GateAction, Judgement, OperatorDecision, Proposal, ProposalI
 use tracing::{info, warn};
 
 use super::Executor;
+use super::motion::StopCause;
 use crate::dry_run::{PlannedPrimitive, planned_motion};
 
 impl Executor<'_> {
@@ -14,6 +15,10 @@ impl Executor<'_> {
         match self.gate.on_proposal(id, proposal.clone()) {
             Proposed::Pending => {
                 info!("proposal {id}");
+                #[cfg(feature = "planted_faults")]
+                proposal
+                    .iter()
+                    .for_each(|proposal| self.plant_at_proposal(proposal.clone()));
                 self.show_plan(proposal.ok());
                 if self.gate.moves_unasked(id) {
                     self.confirm(id, OperatorDecision::Approve);
@@ -91,6 +96,10 @@ impl Executor<'_> {
             decision.name(),
             message.operator_name
         );
+        #[cfg(feature = "planted_faults")]
+        if self.plant_at_confirmation(id, decision) {
+            return;
+        }
         self.confirm(id, decision);
     }
 
@@ -115,9 +124,10 @@ impl Executor<'_> {
         for action in actions {
             match action {
                 GateAction::Move(proposal) => self.begin(*proposal),
+                GateAction::GoHome(id) => self.begin_home(id),
                 GateAction::Cancel => {
-                    if let Some(motion) = &self.motion {
-                        motion.stop.cancel();
+                    if let Some(motion) = &mut self.motion {
+                        motion.stop(StopCause::Operator);
                     }
                 }
                 GateAction::Report(report) => self.report(report, None),

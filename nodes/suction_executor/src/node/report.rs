@@ -30,7 +30,7 @@ impl Executor<'_> {
         } = &report;
         let (outcome, name) = (*outcome, outcome.name());
         match outcome {
-            StepOutcome::Placed | StepOutcome::Rejected => {
+            StepOutcome::Placed | StepOutcome::Rejected | StepOutcome::AtHome => {
                 info!("proposal {id}: {name}. {reason}")
             }
             StepOutcome::Fault => error!("proposal {id}: {name}: {reason}"),

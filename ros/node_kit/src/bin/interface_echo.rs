@@ -18,7 +18,7 @@ use msgs::{
     rcl_interfaces::{GetParameters, SetParameters},
     sctn_msgs::{
         CaptureGoal, ExecutePickPlace, ExecutePickPlaceFeedback, ExecutePickPlaceResult,
-        LoadCheckpoint, LoadDemonstration, ResetCell, Reward, SetStep,
+        LoadCheckpoint, LoadDemonstration, ProposeHome, ResetCell, Reward, SetStep,
     },
     to_cdr,
 };
@@ -55,6 +55,7 @@ impl Active for Echo {
         service::<CaptureGoal>(node)?;
         service::<LoadCheckpoint>(node)?;
         service::<LoadDemonstration>(node)?;
+        service::<ProposeHome>(node)?;
         service::<ResetCell>(node)?;
         service::<SetStep>(node)?;
         carry_out::<ExecutePickPlace>(node)?;

@@ -1,0 +1,97 @@
+//! Faults planted on purpose: `cargo xtask campaign --planted` shows that the monitor of the fault campaign catches each of them. They are
+//! compiled into the executable `suction_executor_planted` only, by the feature `planted_faults`; everywhere else they are constants.
+
+/// A fault of the executor.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[cfg_attr(not(feature = "planted_faults"), allow(dead_code))]
+pub(crate) enum Planted {
+    /// A proposal moves without an approval.
+    MovesUnapproved,
+    /// The approval of any proposal moves the newest one.
+    AnyApproval,
+    /// A superseded proposal can still be approved.
+    ApprovesSuperseded,
+    /// A proposal can still be approved after it was carried out or stopped.
+    ApprovesTwice,
+    /// A stop does not stop the motion.
+    IgnoresStop,
+    /// A stop counts only where it names the proposal that moves.
+    IgnoresStopOfAnother,
+    /// A stop is answered, and the trajectory is not cancelled.
+    AnswersWithoutCancel,
+    /// A motion that was stopped begins again.
+    GoesOnAfterStop,
+    /// A motion that failed begins again when the robot is ready.
+    GoesOnAfterFault,
+    /// A stop switches suction off.
+    DropsOnStop,
+    /// A call for the way home moves the arm.
+    HomeUnasked,
+    /// The watchdog is not told of motions.
+    NoHeartbeat,
+    /// A second executor becomes active.
+    SecondExecutor,
+}
+
+#[cfg(not(feature = "planted_faults"))]
+mod none {
+    use super::Planted;
+
+    pub(crate) const fn is_planted(_: Planted) -> bool {
+        false
+    }
+
+    pub(crate) const fn check() -> anyhow::Result<()> {
+        Ok(())
+    }
+}
+
+#[cfg(not(feature = "planted_faults"))]
+pub(crate) use self::none::{check, is_planted};
+
+#[cfg(feature = "planted_faults")]
+mod some {
+    use super::Planted;
+    use std::sync::LazyLock;
+
+    /// Names the fault; as `Planted` spells it.
+    const VARIABLE: &str = "SCTN_PLANTED_FAULT";
+
+    const ALL: [Planted; 13] = [
+        Planted::MovesUnapproved,
+        Planted::AnyApproval,
+        Planted::ApprovesSuperseded,
+        Planted::ApprovesTwice,
+        Planted::IgnoresStop,
+        Planted::IgnoresStopOfAnother,
+        Planted::AnswersWithoutCancel,
+        Planted::GoesOnAfterStop,
+        Planted::GoesOnAfterFault,
+        Planted::DropsOnStop,
+        Planted::HomeUnasked,
+        Planted::NoHeartbeat,
+        Planted::SecondExecutor,
+    ];
+
+    static PLANTED: LazyLock<Option<Planted>> = LazyLock::new(|| {
+        let name = std::env::var(VARIABLE).ok()?;
+        ALL.into_iter().find(|fault| format!("{fault:?}") == name)
+    });
+
+    pub(crate) fn is_planted(fault: Planted) -> bool {
+        *PLANTED == Some(fault)
+    }
+
+    /// # Errors
+    /// No fault is named.
+    pub(crate) fn check() -> anyhow::Result<()> {
+        anyhow::ensure!(
+            PLANTED.is_some(),
+            "{VARIABLE} names no fault, expected one of {ALL:?}"
+        );
+        Ok(())
+    }
+}
+
+#[cfg(feature = "planted_faults")]
+pub(crate) use self::some::{check, is_planted};

@@ -194,6 +194,14 @@ pub struct Matching {
     pub feature_channels: usize,
     /// Query and key channels of the U-Net, correlated beside them.
     pub context_channels: usize,
+    /// How many peaks of the pick map are compared, window by window, with what stands at the place: the squared difference of
+    /// the features decides among them. 0: the pick map alone decides.
+    #[serde(skip_serializing_if = "is_zero")]
+    pub candidates: usize,
+    /// Weight of what the cells themselves say of turns: the mean squared difference of colour and height, up to a height that all
+    /// cells share, where something appeared in v_k. 0: nothing.
+    #[serde(skip_serializing_if = "is_nothing")]
+    pub shape_weight: f64,
     /// Edge length of the query window round the pick, in cells of stride 2. Odd.
     pub window_cells: usize,
     /// How the query window is rotated.
@@ -209,10 +217,29 @@ impl Default for Matching {
             appearance_channels: 16,
             feature_channels: 6,
             context_channels: 4,
+            candidates: 0,
+            shape_weight: 0.0,
             window_cells: 21,
             rotation_sampling: Interpolation::Bilinear,
         }
     }
+}
+
+/// Checkpoints of before there were candidates do not mention them.
+#[expect(
+    clippy::trivially_copy_pass_by_ref,
+    reason = "serde passes a reference"
+)]
+fn is_zero(count: &usize) -> bool {
+    *count == 0
+}
+
+#[expect(
+    clippy::trivially_copy_pass_by_ref,
+    reason = "serde passes a reference"
+)]
+fn is_nothing(weight: &f64) -> bool {
+    *weight == 0.0
 }
 
 /// How an image is sampled between its cells.
@@ -344,9 +371,44 @@ impl NetworkConfig {
                 ] {
                     check(what, channels(&value), value, "1 to 1024")?;
                 }
+                let good = matching.candidates != 1 && matching.candidates <= 64;
+                check("candidates", good, matching.candidates, "0, or 2 to 64")?;
+                let good = (0.0..=1e3).contains(&matching.shape_weight)
+                    && (matching.shape_weight == 0.0 || matching.candidates > 0);
+                let expected = "0 to 1000, and 0 without candidates";
+                check("shape_weight", good, matching.shape_weight, expected)?;
                 heads(matching.feature_channels, matching.window_cells)
             }
         }
+    }
+
+    /// How many candidates for the pick are compared with what stands at the place.
+    pub(crate) fn candidates(&self) -> usize {
+        match &self.network {
+            Network::Matching(matching) => matching.candidates,
+            Network::Compact(_) | Network::GrConvnet(_) | Network::Resnet43(_) => 0,
+        }
+    }
+
+    /// Weight of the cells themselves in comparing candidates and turns.
+    pub(crate) fn shape_weight(&self) -> f64 {
+        match &self.network {
+            Network::Matching(matching) => matching.shape_weight,
+            Network::Compact(_) | Network::GrConvnet(_) | Network::Resnet43(_) => 0.0,
+        }
+    }
+
+    /// Whether both networks have the same weights: what compares candidates has none.
+    pub(crate) fn has_weights_of(&self, other: &Self) -> bool {
+        let without = |config: &Self| {
+            let mut config = config.clone();
+            if let Network::Matching(matching) = &mut config.network {
+                matching.candidates = 0;
+                matching.shape_weight = 0.0;
+            }
+            config
+        };
+        without(self) == without(other)
     }
 
     /// Refuses heightmaps of another grid: the network has learned this one.

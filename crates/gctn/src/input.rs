@@ -33,6 +33,7 @@ pub(crate) enum Reading {
 /// Channels of [`Reading::Sequence`]: where those of an image begin, four each.
 pub(crate) mod sequence {
     pub const OBSERVATION: i64 = 0;
+    pub const PREVIOUS: i64 = 4;
     pub const IMAGE: i64 = 8;
     pub const CHANNELS: usize = 24;
 }

@@ -6,6 +6,7 @@
 mod augment;
 mod batch;
 mod calibration;
+mod candidates;
 mod checkpoint;
 mod config;
 mod correlation;

@@ -6,6 +6,7 @@ use std::path::Path;
 use tch::{Kind, Tensor};
 
 use crate::augment::Warp;
+use crate::candidates::{add_fits, add_shape};
 use crate::input::{check_goal, check_heightmap, encode, rotation_angle, tensor, to_world};
 use crate::losses::place_logits;
 use crate::network::{Builder, Features, Model};
@@ -113,10 +114,11 @@ impl Policy {
         let workspace = &observation.workspace;
         tch::no_grad(|| {
             let features = self.features(observation, goal.into())?;
-            let (pick_px, pick_score, pick_map) = self.pick(&features.pick, workspace, exclude)?;
+            let (pick_px, pick_score, pick_map) = self.pick(&features, workspace, exclude)?;
             let turns = [(0..config.rotations).collect()];
             let grid = &self.model.grid;
             let logits = place_logits(grid, &features, &[pick_px], &turns, config.rotations);
+            add_shape(grid, &features, config, pick_px, &logits);
             let (place_px, rotation, place_score, place_map) =
                 self.place(&logits.squeeze_dim(0))?;
 
@@ -181,12 +183,12 @@ impl Policy {
 
     fn pick(
         &self,
-        logits: &Tensor,
+        features: &Features,
         workspace: &Workspace,
         exclude: &[Disk],
     ) -> Result<(Point2<f64>, f64, ScoreMap), Error> {
-        let grid = &self.model.grid;
-        let mut logits = values(logits, "the pick map")?;
+        let (grid, config) = (&self.model.grid, &self.model.config);
+        let mut logits = values(&features.pick, "the pick map")?;
         let center_px = |index: usize| {
             let (row, col) = (index / grid.cols, index % grid.cols);
             Point2::new(
@@ -196,12 +198,16 @@ impl Policy {
         };
         for disk in exclude {
             let disk_px = workspace.point_px(&disk.center_m);
-            let radius_px = disk.radius_m / self.model.config.pixel_size_m;
+            let radius_px = disk.radius_m / config.pixel_size_m;
             for (index, logit) in logits.iter_mut().enumerate() {
                 if (disk_px - center_px(index)).norm() <= radius_px {
                     *logit = f32::NEG_INFINITY;
                 }
             }
+        }
+        match config.candidates() {
+            0 => {}
+            _ => add_fits(grid, features, config, &mut logits)?,
         }
         let best = argmax(&logits);
         let top = logits[best];
@@ -262,7 +268,7 @@ fn done(features: &Features) -> Result<Option<f64>, Error> {
 }
 
 /// The numbers of a tensor, all finite.
-fn values(tensor: &Tensor, what: &'static str) -> Result<Vec<f32>, Error> {
+pub(crate) fn values(tensor: &Tensor, what: &'static str) -> Result<Vec<f32>, Error> {
     let tensor = tensor
         .to_device(tch::Device::Cpu)
         .to_kind(Kind::Float)

@@ -5,6 +5,7 @@ use std::path::Path;
 use tch::Tensor;
 
 use crate::batch::{Batch, BatchMaker};
+use crate::candidates::candidate_loss;
 use crate::checkpoint::{self, File};
 use crate::input::Label;
 use crate::losses::{done_loss, first_place_loss, pick_loss, place_loss};
@@ -66,7 +67,7 @@ impl Trainer {
     /// The same training, begun with the weights of a checkpoint of the same network instead of random ones.
     pub fn starting_from(self, checkpoint: &Path) -> Result<Self, Error> {
         let (file, saved, _) = checkpoint::open(checkpoint)?;
-        if saved != self.model.config {
+        if !saved.has_weights_of(&self.model.config) {
             let [saved, asked] = [&saved, &self.model.config].map(checkpoint::json);
             return Err(file.error(format!("it is of the network {saved}, expected {asked}")));
         }
@@ -195,8 +196,13 @@ impl Trainer {
         let to_do: Vec<usize> = (0..labels.len()).filter(to_do).collect();
         let of = |features: &Features, labels: &[Label], rng: &mut ChaCha8Rng| {
             let (loss, rotations) = (self.config.place_loss, network.rotations);
+            let pick = pick_loss(grid, sigma, features, labels);
+            let pick = match network.candidates() {
+                0 => pick,
+                _ => pick + candidate_loss(grid, features, network, labels),
+            };
             [
-                pick_loss(grid, sigma, features, labels),
+                pick,
                 place_loss(grid, loss, sigma, rotations, features, labels, rng),
             ]
         };

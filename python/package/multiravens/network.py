@@ -43,6 +43,8 @@ _DEFAULTS: dict[str, dict[str, Any]] = {
         "appearance_channels": 16,
         "feature_channels": 6,
         "context_channels": 4,
+        "candidates": 0,
+        "shape_weight": 0.0,
         "window_cells": 21,
         "rotation_sampling": "bilinear",
     },
@@ -50,6 +52,11 @@ _DEFAULTS: dict[str, dict[str, Any]] = {
 }
 # Mean and standard deviation of colour (as a fraction) and height (m) in Ravens, which the published network is fed with.
 _COLOR, _HEIGHT_M = (0.18877631, 0.07276466), (0.00509261, 0.00903967)
+# Candidates for the pick are more than so many cells apart; a window is looked for in so many cells around the place; every so
+# manyth rotation is tried.
+_APART_CELLS, _SHIFT_CELLS, _TURN_STRIDE = 4.0, 3, 2
+# What appeared has risen by more than this (of 40 mm), or its colour has changed by more than that (of 128, over three channels).
+_RISEN, _RECOLORED = 0.1, 0.5
 
 
 class CheckpointError(ValueError):
@@ -71,6 +78,10 @@ class Features(NamedTuple):
     """Of ``matching``: logits of places whatever the pick, rows x cols."""
     done: torch.Tensor | None
     """Of ``matching``: logit that the step is done already."""
+    fit: tuple[torch.Tensor, torch.Tensor] | None = None
+    """Of ``matching``: query and key whose correlation is minus half the squared difference of what is seen and shown."""
+    cells: tuple[torch.Tensor, torch.Tensor, torch.Tensor] | None = None
+    """Of ``matching``: colour and height, 4 x rows x cols, of the observation, the previous goal and the goal."""
 
 
 class Decision(NamedTuple):
@@ -280,7 +291,74 @@ class Network(nn.Module):
         kernels = torch.stack([window(features.query, center, turn, size, bilinear) for turn in turns])
         rows, cols = self.grid
         logits = features.scale * F.conv2d(features.key[None], kernels)[0, :, :rows, :cols]
-        return logits if features.place is None else logits + features.place
+        if features.place is None:
+            return logits
+        logits = logits + features.place
+        return self._add_shape(features, center, logits) if network.get("shape_weight", 0.0) > 0 else logits
+
+    def _crop(self, place: torch.Tensor) -> tuple[int, int, int]:
+        """First row and column, in a key with its margin, of what windows are compared with around the likeliest place; its edge."""
+        size = self.config["network"]["window_cells"]
+        edge = size + 2 * _SHIFT_CELLS
+        at = divmod(int(place.argmax()), self.grid[1])
+        row, col = (min(max(a - _SHIFT_CELLS, 0), whole + size // 2 * 2 - edge) for a, whole in zip(at, self.grid, strict=True))
+        return row, col, edge
+
+    def _add_shape(self, features: Features, center: Sequence[float], logits: torch.Tensor) -> torch.Tensor:
+        """Place logits with how well the cells at the pick, turned and shifted, fit what appeared at the place."""
+        assert features.place is not None and features.cells is not None
+        network, rotations = self.config["network"], self.config["rotations"]
+        size, (rows, cols) = network["window_cells"], self.grid
+        seen, before, shown = features.cells
+        change = shown - before
+        recolored = (change[:3].abs().sum(0) > _RECOLORED) & (change[3] > -_RISEN)
+        appeared = ((change[3] > _RISEN) | recolored).to(shown.dtype)
+        # With its surroundings, so that it is told from a larger thing.
+        mask = F.max_pool2d(appeared[None], 5, 1, 2)
+        query = torch.cat([seen, seen.square().sum(0, keepdim=True), torch.ones_like(mask)])
+        key = torch.cat([mask * shown, -mask / 2, -mask * shown.square().sum(0, keepdim=True) / 2, mask, -mask * shown[3:]])
+        top, left, edge = self._crop(features.place)
+        key = F.pad(key, (size // 2,) * 4)[None, :, top : top + edge, left : left + edge]
+        bilinear = network["rotation_sampling"] == "bilinear"
+        turns = (2 * math.pi * turn / rotations for turn in range(rotations))
+        windows = torch.stack([window(query, center, turn, size, bilinear) for turn in turns])
+        area = F.conv2d(key[:, 6:7], torch.ones(1, 1, size, size)).clamp_min(1.0)[0]
+        # What all heights differ by does not count: an object may stand on another one.
+        heights = F.conv2d(key[:, 6:8], windows[:, [3, 5]])[0] / area
+        shape = network["shape_weight"] * (F.conv2d(key[:, :6], windows)[0] / area + heights.square() / 2)
+        added = torch.full_like(logits, float(shape.min()))
+        high, wide = min(shape.shape[1], rows - top), min(shape.shape[2], cols - left)
+        added[:, top : top + high, left : left + wide] = shape[:, :high, :wide]
+        return logits + added
+
+    def add_fits(self, features: Features, picks: Any) -> Any:
+        """Logits of picks (rows x cols, numpy) with how well their highest peaks fit what is to be placed: cells around a peak
+        share its fit, all others have the worst."""
+        network, rotations = self.config["network"], self.config["rotations"]
+        rows, cols = self.grid
+        peaks: list[tuple[int, int]] = []
+        for cell in np.argsort(-picks, axis=None, kind="stable"):
+            row, col = divmod(int(cell), cols)
+            if len(peaks) == network["candidates"] or picks[row, col] == -np.inf:
+                break
+            if all(math.hypot(row - peak[0], col - peak[1]) > _APART_CELLS for peak in peaks):
+                peaks.append((row, col))
+        if not peaks or features.place is None or features.fit is None:
+            return picks
+        query, key = features.fit
+        bilinear, size = network["rotation_sampling"] == "bilinear", network["window_cells"]
+        top, left, edge = self._crop(features.place)
+        key = key[None, :, top : top + edge, left : left + edge]
+        turns = [2 * math.pi * turn / rotations for turn in range(0, rotations, _TURN_STRIDE)]
+        fits = []
+        for row, col in peaks:
+            windows = torch.stack([window(query, [col, row], turn, size, bilinear) for turn in turns])
+            fits.append(float((features.scale * F.conv2d(key, windows)).max()))
+        y, x = np.mgrid[:rows, :cols]
+        added = np.full_like(picks, min(fits))
+        for (row, col), fit in reversed(list(zip(peaks, fits, strict=True))):
+            added[np.hypot(y - row, x - col) <= _APART_CELLS] = fit
+        return picks + added
 
     def _weight(self, name: str) -> torch.Tensor:
         return self.get_parameter(name)
@@ -342,7 +420,13 @@ class Network(nn.Module):
         query = torch.cat([seen_features, query])
         key = torch.cat([shown_features * gate, key])
         margin = network["window_cells"] // 2
-        return Features(pick, query, F.pad(key, (margin,) * 4), self._weight("scale"), place, (done * attention).sum())
+        # gate (seen shown - seen^2 / 2 - shown^2 / 2) is -gate (seen - shown)^2 / 2.
+        half_square = [x.square().sum(0, keepdim=True) / 2 for x in (seen_features, shown_features)]
+        fit_query = torch.cat([seen_features, half_square[0], torch.ones_like(gate)])
+        fit_key = F.pad(torch.cat([shown_features * gate, -gate, -gate * half_square[1]]), (margin,) * 4)
+        cells = tuple(F.avg_pool2d(x[:, start : start + 4], 2)[0] for start in (0, 4, 8))
+        done = (done * attention).sum()
+        return Features(pick, query, F.pad(key, (margin,) * 4), self._weight("scale"), place, done, (fit_query, fit_key), cells)
 
     def _hourglass(self, name: str, x: torch.Tensor) -> torch.Tensor:
         """ResNet43_8s of Ravens."""
@@ -486,6 +570,8 @@ class Policy:
             picks[away <= radius_m / pixel] = -np.inf
         if not np.isfinite(picks.max()):
             raise ValueError("exclude: leaves nothing to pick, expected fewer or a smaller radius_m")
+        if config["network"].get("candidates", 0):
+            picks = net.add_fits(features, picks)
         row, col = divmod(int(picks.argmax()), cols)
         pick_px = [float(x_px[row, col]), float(y_px[row, col])]
         pick_map = np.exp(picks - picks.max())

@@ -4,7 +4,7 @@ use tch::{Kind, Tensor};
 
 use super::compact::UNet;
 use super::parameters::{Builder, Conv, Init, channels_last};
-use super::{Features, FirstPlace};
+use super::{Features, FirstPlace, Fit};
 use crate::Matching;
 use crate::input::sequence;
 
@@ -52,6 +52,8 @@ pub(super) struct MatchingNet {
     scale: Tensor,
     channels: i64,
     margin: i64,
+    /// Whether candidates for the pick are compared with what was moved.
+    has_candidates: bool,
 }
 
 /// Heads on the U-Net: place, pick bias, query, key with gate, done.
@@ -96,6 +98,7 @@ impl MatchingNet {
             scale: builder.scalar("scale", correlated.recip()),
             channels: channels as i64,
             margin: config.window_cells as i64 / 2,
+            has_candidates: config.candidates > 0,
         }
     }
 
@@ -132,13 +135,29 @@ impl MatchingNet {
             features.narrow(0, samples, samples),
         );
         let done = head(4, &self.done).flatten(1, -1);
+        let margin = [self.margin; 4];
+        let fit = self.has_candidates.then(|| {
+            // gate (seen shown - seen^2 / 2 - shown^2 / 2) is -gate (seen - shown)^2 / 2.
+            let half_square =
+                |x: &Tensor| (x * x).sum_dim_intlist([1].as_slice(), true, None::<Kind>) * 0.5;
+            let query = [seen.shallow_clone(), half_square(&seen), gate.ones_like()];
+            let key = [&shown * &gate, -&gate, -&gate * half_square(&shown)];
+            Fit {
+                query: Tensor::cat(&query, 1),
+                key: Tensor::cat(&key, 1).constant_pad_nd(margin),
+                cells: [sequence::OBSERVATION, sequence::PREVIOUS, sequence::IMAGE].map(|from| {
+                    let cells = image(from).to_kind(self.scale.kind());
+                    cells.avg_pool2d([2, 2], [2, 2], [0, 0], false, true, None::<i64>)
+                }),
+            }
+        });
         Features {
             pick,
             query: Tensor::cat(&[seen, head(2, &self.query)], 1),
-            key: Tensor::cat(&[shown * gate, head(3, &self.key)], 1)
-                .constant_pad_nd([self.margin; 4]),
+            key: Tensor::cat(&[shown * gate, head(3, &self.key)], 1).constant_pad_nd(margin),
             scale: self.scale.shallow_clone(),
             first: Some(FirstPlace {
+                fit,
                 place,
                 done: (done * attention).sum_dim_intlist([1].as_slice(), false, None::<Kind>),
             }),

@@ -42,6 +42,18 @@ pub(crate) struct FirstPlace {
     pub place: Tensor,
     /// Logit that the step is done already, N.
     pub done: Tensor,
+    /// By what candidates for the pick are compared with what was moved.
+    pub fit: Option<Fit>,
+}
+
+/// Features whose correlation is minus half the squared difference of what is seen and what was shown, where that counts.
+pub(crate) struct Fit {
+    /// Of the observation, N x C x rows x cols.
+    pub query: Tensor,
+    /// Of v_k, N x C x rows x cols, with `margin` cells around.
+    pub key: Tensor,
+    /// Colour and height (4 channels) of the observation, of v_{k-1} and of v_k, each N x 4 x rows x cols: not learned.
+    pub cells: [Tensor; 3],
 }
 
 impl Features {
@@ -57,6 +69,11 @@ impl Features {
             first: self.first.as_ref().map(|first| FirstPlace {
                 place: of(&first.place),
                 done: of(&first.done),
+                fit: first.fit.as_ref().map(|fit| Fit {
+                    query: of(&fit.query),
+                    key: of(&fit.key),
+                    cells: fit.cells.each_ref().map(of),
+                }),
             }),
         }
     }

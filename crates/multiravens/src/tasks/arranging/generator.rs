@@ -2,13 +2,14 @@
 
 use super::Arrangement;
 use super::description::{
-    Arranging, Color, Fixture, Goal, Object, Place, Range, ShapeDescription, Start,
+    Arranging, Color, Fixture, Goal, Object, PALETTE, Place, Range, ShapeDescription, Start,
 };
 use crate::colors;
 use crate::seed::stream;
 use crate::tasks::{ParameterError, TaskModule, check_range, field, read};
 use nalgebra::{Isometry2, Vector2};
 use rand::RngExt;
+use rand::seq::IndexedRandom as _;
 use rand_chacha::ChaCha8Rng;
 use serde::{Deserialize, Serialize};
 use serde_yaml_ng::Value;
@@ -27,6 +28,10 @@ const EDGE_M: f64 = 0.03;
 const JITTER_M: f64 = 0.015;
 /// ... and turned by at most this.
 const JITTER_RAD: f64 = 0.25;
+/// Objects of one colour and kind differ by this in at least one edge, ...
+const APART_M: f64 = 0.006;
+/// ... if so many draws find one that does.
+const SHAPE_DRAWS: usize = 50;
 
 /// What problems are drawn from; ranges are `[least, most]`.
 #[derive(Clone, Debug, Deserialize)]
@@ -60,6 +65,8 @@ pub struct Ranges {
     pub ordered: f64,
     /// Share of problems in which the objects of the goals change places from scene to scene.
     pub exchanged: f64,
+    /// Share of problems whose objects have one to three colours between them, so that shape and size tell them apart.
+    pub shared_colors: f64,
 }
 
 /// Relative frequencies of kinds of shapes.
@@ -172,6 +179,7 @@ impl Ranges {
             ("stacked", self.stacked),
             ("ordered", self.ordered),
             ("exchanged", self.exchanged),
+            ("shared_colors", self.shared_colors),
         ];
         for (name, share) in shares {
             check_range(name, share, 0.0, 1.0)?;
@@ -224,6 +232,7 @@ impl Ranges {
         let fixtures = self.draw_fixtures(rng);
         let wanted = count(self.goals, rng);
         let total = wanted + count(self.extra_objects, rng);
+        let colors = self.draw_colors(rng);
         let mut objects: Vec<Object> = Vec::new();
         let mut names = Vec::new();
         while names.len() < total {
@@ -233,10 +242,11 @@ impl Ranges {
                 0
             };
             let count = (1 + more).min(total - names.len());
+            let color = colors[rng.random_range(0..colors.len())];
             let object = Object {
                 name: format!("object {}", objects.len() + 1),
-                shape: self.draw_shape(rng),
-                color: Color::Any,
+                shape: self.draw_other_shape(&objects, &color, rng),
+                color,
                 mass_kg: 0.02,
                 count,
                 start: None,
@@ -350,6 +360,36 @@ impl Ranges {
         (0..fixtures).map(fixture).collect()
     }
 
+    /// Colours that the objects of a problem are drawn from.
+    fn draw_colors(&self, rng: &mut ChaCha8Rng) -> Vec<Color> {
+        if !rng.random_bool(self.shared_colors) {
+            return vec![Color::Any];
+        }
+        let count = rng.random_range(1..=3);
+        let colors = PALETTE.sample(rng, count);
+        colors.map(|(_, rgb)| Color::Rgb(*rgb)).collect()
+    }
+
+    /// A shape that is told apart from those of the objects of the same colour.
+    fn draw_other_shape(
+        &self,
+        objects: &[Object],
+        color: &Color,
+        rng: &mut ChaCha8Rng,
+    ) -> ShapeDescription {
+        let mut shape = self.draw_shape(rng);
+        for _ in 0..SHAPE_DRAWS {
+            let looks_like = |other: &Object| {
+                *color != Color::Any && other.color == *color && are_alike(&shape, &other.shape)
+            };
+            if !objects.iter().any(looks_like) {
+                break;
+            }
+            shape = self.draw_shape(rng);
+        }
+        shape
+    }
+
     fn draw_shape(&self, rng: &mut ChaCha8Rng) -> ShapeDescription {
         let Kinds {
             cuboid,
@@ -426,6 +466,16 @@ fn within([least, most]: [f64; 2], rng: &mut ChaCha8Rng) -> f64 {
 
 fn count([least, most]: [usize; 2], rng: &mut ChaCha8Rng) -> usize {
     rng.random_range(least..=most)
+}
+
+/// Whether two shapes are of one kind and nearly one size.
+fn are_alike(one: &ShapeDescription, other: &ShapeDescription) -> bool {
+    let same_kind = std::mem::discriminant(one) == std::mem::discriminant(other);
+    let sizes = size_m(one).into_iter().zip(size_m(other));
+    same_kind
+        && sizes
+            .into_iter()
+            .all(|(one, other)| (one - other).abs() < APART_M)
 }
 
 /// Whether an object may stand on the middle of another one.

@@ -57,8 +57,7 @@ def approvable(console: CLIENT.Console, since: str | None = None) -> dict:
             elif phase == "proposed" and state["proposal"]["id"] == since:
                 # It was approved by a console that is no more: the executor says what became of it.
                 console.decide("approve", state["proposal"])
-            elif phase == "proposed" and "approve" not in state["refused"] and state["motion"] is not None:
-                # The executor knows the proposal: it has planned its motion.
+            elif phase == "proposed" and "approve" not in state["refused"]:
                 return state["proposal"]
         except CLIENT.Refused:
             time.sleep(0.1)

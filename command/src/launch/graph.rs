@@ -16,7 +16,8 @@ pub struct Settings {
     /// Folder of the problem's file.
     pub problems_dir: PathBuf,
     pub seed: u64,
-    pub demonstration: PathBuf,
+    /// Without one, the oracle waits for one that is taught.
+    pub demonstration: Option<PathBuf>,
     pub checkpoint: PathBuf,
     /// What says which goal is next, as goal_oracle names it.
     pub goal_module: String,
@@ -84,7 +85,7 @@ impl Settings {
                 ("urdf", path(&root.join("urdf/workcell.urdf"))),
             ],
             "goal_oracle" => vec![
-                ("demonstration", path(&self.demonstration)),
+                ("start_empty", self.demonstration.is_none().to_string()),
                 ("goal_module", self.goal_module.clone()),
                 ("embedding", path(&self.embedding)),
                 ("checkpoint", path(&self.checkpoint)),
@@ -96,7 +97,6 @@ impl Settings {
                     // Several graphs on one machine do not take each other's port.
                     ("port", "0".to_owned()),
                     ("address_file", path(&console.address_file)),
-                    ("demonstration", path(&self.demonstration)),
                     ("library", path(&console.library)),
                     ("checkpoints", path(&root.join("config/checkpoints"))),
                     ("checkpoint", path(&self.checkpoint)),
@@ -126,7 +126,10 @@ impl Settings {
             "--params-file".into(),
             file.display().to_string(),
         ];
-        let parameters = self.parameters(root, node);
+        let mut parameters = self.parameters(root, node);
+        if let (Some(shown), "goal_oracle" | "operator_console") = (&self.demonstration, node) {
+            parameters.push(("demonstration", shown.display().to_string()));
+        }
         for (name, value) in parameters.iter().chain([
             &("use_sim_time", "true".to_owned()),
             &("autostart", "false".to_owned()),

@@ -13,7 +13,7 @@ use graph::{Graph, Settings};
 use heightmap::Heightmap;
 use msgs::convert::{self, heightmap_from_msg};
 use msgs::sctn_msgs::{ConfirmationRefused, Goal, PickPlace, Reward, StepConfirmation, StepResult};
-use multiravens::{Environment, EpisodeSeed};
+use multiravens::{Environment, EpisodeSeed, Problem};
 use node_kit::{Node, Qos, ns_from_stamp, plain_node, wait_for_end};
 use operator::{OperatorKind, RequireApproval};
 use recording::{LAST_HEIGHTMAP, LAST_WORDS, RunRecorder};
@@ -65,8 +65,8 @@ pub struct Launch {
     /// With --require-approval unsure, a proposal of at least this probability of success is carried out unasked
     #[arg(long, default_value_t = 0.99)]
     sure_probability: f32,
-    /// Checkpoint of the policy [default: the shipped one; with --demonstration-seed or --goal-module sequence the shipped one for
-    /// any start]
+    /// Checkpoint of the policy [default: the shipped one; with --demonstration-seed or --goal-module sequence, or where the
+    /// problem has no goals, the shipped one for any start]
     #[arg(long)]
     checkpoint: Option<PathBuf>,
     /// Checkpoint for the goal module of that name [default: the shipped one]
@@ -107,10 +107,10 @@ impl Launch {
     pub fn run(self, root: &Root) -> Result<()> {
         let problem = root.problem(&self.problem)?;
         let work_cell = root.work_cell()?;
-        let max_steps = {
+        let (max_steps, has_goals) = {
             let mut environment = Environment::new(&problem, &work_cell);
             environment.reset(self.seed)?;
-            environment.max_steps()
+            (environment.max_steps(), environment.goal_count() > 0)
         };
         let temporary = tempfile::tempdir().context("folder for the demonstration")?;
         let folder = self
@@ -125,42 +125,23 @@ impl Launch {
             );
         }
         std::fs::create_dir_all(&folder).with_context(|| folder.display().to_string())?;
-        let shown_seed = EpisodeSeed {
-            scene: self.seed,
-            start: self.demonstration_seed.unwrap_or(self.seed),
-        };
-        println!("demonstrating {} with seed {shown_seed}", self.problem);
-        let shown = folder.join("demonstration");
-        if shown.exists() {
-            let found = Demonstration::read(&shown)?;
-            let expected = format!("{}, seed {shown_seed}", problem.name());
-            let seed = EpisodeSeed {
-                scene: found.seed,
-                start: found.start_seed,
-            };
-            let found = format!("{}, seed {seed}", found.problem);
-            if found != expected {
-                bail!(
-                    "{}: a demonstration of {found}, expected {expected}",
-                    shown.display()
-                );
-            }
-        } else {
-            demonstration(&problem, &work_cell, shown_seed)?.write(&shown)?;
-        }
+        let shown = self.demonstration(&problem, &work_cell, &folder, has_goals)?;
         let (problems_dir, name) = root.problem_place(&self.problem);
         let settings = Settings {
             problem: name,
             problems_dir: std::path::absolute(problems_dir)?,
             seed: self.seed,
-            demonstration: std::path::absolute(shown)?,
             checkpoint: self.checkpoint.clone().unwrap_or_else(|| {
-                if self.demonstration_seed.is_some() || self.goal_module == SEQUENCE {
+                if shown.is_none()
+                    || self.demonstration_seed.is_some()
+                    || self.goal_module == SEQUENCE
+                {
                     root.any_start_checkpoint()
                 } else {
                     root.shipped_checkpoint()
                 }
             }),
+            demonstration: shown,
             goal_module: self.goal_module.clone(),
             embedding: self
                 .embedding
@@ -209,6 +190,53 @@ impl Launch {
             bail!("{} with seed {} was not completed", self.problem, self.seed);
         }
         Ok(())
+    }
+
+    /// What the run repeats; nothing where the problem has no goals: then a person teaches it.
+    fn demonstration(
+        &self,
+        problem: &Problem,
+        work_cell: &ur5::WorkCell,
+        folder: &Path,
+        has_goals: bool,
+    ) -> Result<Option<PathBuf>> {
+        if !has_goals {
+            if self.operator != OperatorKind::Web {
+                bail!(
+                    "{} has no goals: there is nothing to demonstrate; teach it with --operator web",
+                    self.problem
+                );
+            }
+            println!(
+                "{} has no goals: teach it at the operator's page",
+                self.problem
+            );
+            return Ok(None);
+        }
+        let shown_seed = EpisodeSeed {
+            scene: self.seed,
+            start: self.demonstration_seed.unwrap_or(self.seed),
+        };
+        println!("demonstrating {} with seed {shown_seed}", self.problem);
+        let shown = folder.join("demonstration");
+        if shown.exists() {
+            let found = Demonstration::read(&shown)?;
+            let expected = format!("{}, seed {shown_seed}", problem.name());
+            let seed = EpisodeSeed {
+                scene: found.seed,
+                start: found.start_seed,
+            };
+            let found = format!("{}, seed {seed}", found.problem);
+            if found != expected {
+                bail!(
+                    "{}: a demonstration of {found}, expected {expected}",
+                    shown.display()
+                );
+            }
+        } else {
+            demonstration(problem, work_cell, shown_seed)?.write(&shown)?;
+        }
+        Ok(Some(std::path::absolute(shown)?))
     }
 
     fn require_approval(&self) -> RequireApproval {

@@ -464,18 +464,18 @@ impl Environment {
         }
     }
 
-    /// Reward of the present state: the mean over the modules of the share of goals reached.
+    /// Reward of the present state: the mean over the modules with goals of the share of them that is reached.
     pub fn total_reward(&self) -> f64 {
-        let shares = self
-            .tasks
-            .iter()
-            .map(|p| p.reached.len() as f64 / p.task.goal_count() as f64);
-        shares.sum::<f64>() / self.tasks.len().max(1) as f64
+        let wanted = |p: &&Progress| p.task.goal_count() > 0;
+        let shares = self.tasks.iter().filter(wanted);
+        let shares = shares.map(|p| p.reached.len() as f64 / p.task.goal_count() as f64);
+        let modules = self.tasks.iter().filter(wanted).count();
+        shares.sum::<f64>() / modules.max(1) as f64
     }
 
-    /// Whether every goal of every module is reached.
+    /// Whether every goal of every module is reached. Without goals, never.
     pub fn is_complete(&self) -> bool {
-        self.tasks.iter().all(Progress::is_complete)
+        self.goal_count() > 0 && self.tasks.iter().all(Progress::is_complete)
     }
 
     /// Whether the episode is over: complete, or out of steps.

@@ -73,3 +73,20 @@ fn the_names_in_the_folder_are_found() {
     expected.sort_unstable();
     assert_eq!(Problem::names(&folder()).unwrap(), expected);
 }
+
+#[test]
+fn a_scene_without_goals_loads_and_is_never_complete() {
+    let work_cell = WorkCell::builtin().unwrap();
+    let scenes = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../config/scenes");
+    for name in Problem::names(&scenes).unwrap() {
+        let problem = Problem::load(&scenes, &name).unwrap();
+        let mut environment = Environment::new(&problem, &work_cell);
+        environment.reset(10_000).unwrap();
+        assert!(environment.cell().is_settled(), "{name}");
+        assert_eq!(environment.goal_count(), 0, "{name}");
+        assert!(environment.demonstrate().is_none(), "{name}");
+        let assessment = environment.assess();
+        assert_eq!(assessment.total_reward, 0.0, "{name}");
+        assert!(!assessment.complete, "{name}");
+    }
+}

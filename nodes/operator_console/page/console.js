@@ -94,9 +94,6 @@ function obstacle(action) {
   if (action === "continue") return state.phase === "stopped" ? undefined : "The run is not stopped.";
   const refused = state.refused[action];
   if (refused) return `${refused.reason} ${refused.advice}`;
-  // An executor that has not planned the proposal does not know it: an approval would be lost.
-  if (action === "approve" && !state.motion) return "The executor has not planned the motion yet. Wait a moment; if it stays so, look whether suction_executor is active.";
-  if (action === "approve" && state.motion.reason) return `The motion cannot be planned: ${state.motion.reason}. Reject it, or correct pick and place.`;
   if (action === "approve" && pictures.get("present")?.number !== state.heightmap?.number) return "The newest picture is on its way.";
   return undefined;
 }
@@ -211,6 +208,7 @@ $("save-lesson").addEventListener("submit", (event) => {
 
 const LESSON_WORDS = {
   choosing: "Click what to pick, then where to place it.",
+  planning: "The executor plans the motion.",
   moving: "The arm moves. Watch it; stop if anything is wrong.",
   looking: "The cameras look at the result.",
   judging: "Is this as it should be?",
@@ -423,8 +421,7 @@ function renderButtons() {
   }
   const main = judging ? "advance" : stopped ? "continue" : "approve";
   setText($("why"), answer || (lesson && isOperator() ? "" : obstacle(main)) || "");
-  const refused = state?.refused.approve;
-  const stale = link !== "up" || (state?.phase === "proposed" && Boolean(refused));
+  const stale = link !== "up" || (state?.phase === "proposed" && state.stale);
   document.body.classList.toggle("stale", stale);
 }
 

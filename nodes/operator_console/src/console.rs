@@ -13,6 +13,7 @@ use serde::Serialize;
 use step_protocol::StepOutcome;
 use tokio::sync::{mpsc, watch};
 
+use self::teach::Planning;
 use crate::lesson::{Lesson, LessonState};
 use crate::refusal::Refusal;
 use crate::run::{Decision, InvalidMessage, Phase, Pose, Run, Snapshot};
@@ -47,6 +48,8 @@ pub struct State {
     pub sessions: Sessions,
     /// The lesson that is being given.
     lesson: Option<Lesson>,
+    /// The motion of the lesson that is approved as soon as it is planned.
+    planning: Option<Planning>,
     /// The policy's checkpoint, once it was changed.
     pub policy: Option<PolicyState>,
     /// Proposal and decision of our own confirmations: what they change was changed when they were made.
@@ -93,6 +96,7 @@ impl Console {
                 run,
                 sessions,
                 lesson: None,
+                planning: None,
                 policy: None,
                 sent: VecDeque::new(),
                 commands: None,
@@ -182,6 +186,9 @@ impl State {
         if self.lesson.is_none() || decision != Decision::Stop {
             self.run.check(decision, now)?;
         }
+        if decision == Decision::Stop {
+            self.drop_planning();
+        }
         if decision != Decision::Stop && self.run.current_id() != Some(proposal_id) {
             return Err(Refusal::new(
                 format!("Proposal {proposal_id} is not the present one."),
@@ -194,12 +201,12 @@ impl State {
             operator_name: self.sessions.name(viewer).to_owned(),
             ..StepConfirmation::default()
         };
-        self.confirm(confirmation)
+        self.confirm(confirmation, now)
     }
 
-    fn confirm(&mut self, confirmation: StepConfirmation) -> Result<(), Refusal> {
+    fn confirm(&mut self, confirmation: StepConfirmation, now: Duration) -> Result<(), Refusal> {
         self.send(Command::Confirm(confirmation.clone()))?;
-        self.run.on_confirmation(&confirmation);
+        self.run.on_confirmation(&confirmation, now);
         if self.sent.len() == SENT {
             self.sent.pop_front();
         }
@@ -240,12 +247,13 @@ impl State {
         if by_itself && self.lesson.is_none() && self.run.phase() == Phase::Stopped {
             // The executor has stopped by itself, for instance because the operator was gone: everybody has to know that the run
             // is stopped, or it cannot be continued. While the console is inactive there is nobody to tell.
-            let _ = self.confirm(StepConfirmation {
+            let stop = StepConfirmation {
                 proposal_id: message.proposal_id,
                 decision: StepConfirmation::STOP,
                 operator_name: "operator_console".to_owned(),
                 ..StepConfirmation::default()
-            });
+            };
+            let _ = self.confirm(stop, now);
         }
         if let Some(lesson) = &mut self.lesson {
             lesson.on_result(&result);
@@ -322,14 +330,15 @@ impl State {
     }
 
     /// The way home that an operator has asked for is proposed: their asking is its approval.
-    pub(crate) fn approve_home(&mut self, proposal_id: u64, operator_name: String) {
-        // While the console is inactive nothing is sent, and the arm stays.
-        let _ = self.confirm(StepConfirmation {
+    pub(crate) fn approve_home(&mut self, proposal_id: u64, operator_name: String, now: Duration) {
+        let approval = StepConfirmation {
             proposal_id,
             decision: StepConfirmation::APPROVE,
             operator_name,
             ..StepConfirmation::default()
-        });
+        };
+        // While the console is inactive nothing is sent, and the arm stays.
+        let _ = self.confirm(approval, now);
     }
 
     /// The operator continues the run with a step, the present one or another.
@@ -349,14 +358,24 @@ impl State {
         self.send(Command::SetStep(step, name))
     }
 
+    /// Asks again what was not heard. Returns whether anything was not.
+    pub fn ask_again(&mut self, now: Duration) -> bool {
+        let is_unplanned = self.give_planning_up(now);
+        let is_unanswered = self.run.ask_again(now);
+        if is_unanswered && let Some(lesson) = &mut self.lesson {
+            lesson.forget_motion();
+        }
+        is_unplanned || is_unanswered
+    }
+
     /// A confirmation has come on the topic; one of ours is known already.
-    pub fn on_confirmation(&mut self, message: &StepConfirmation) {
+    pub fn on_confirmation(&mut self, message: &StepConfirmation, now: Duration) {
         let key = (message.proposal_id, message.decision);
         match self.sent.iter().position(|sent| *sent == key) {
             Some(index) => {
                 self.sent.remove(index);
             }
-            None => self.run.on_confirmation(message),
+            None => self.run.on_confirmation(message, now),
         }
     }
 

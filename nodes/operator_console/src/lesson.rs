@@ -24,6 +24,8 @@ const LONGEST_NAME: usize = 40;
 pub enum LessonPhase {
     /// The person chooses pick and place.
     Choosing,
+    /// The executor plans the motion.
+    Planning,
     /// The arm moves.
     Moving,
     /// The arm has moved, and its result is not in view yet.
@@ -39,6 +41,8 @@ struct Trial {
     before: Arc<Heightmap>,
     /// It takes the last step back.
     undoes: bool,
+    /// It was planned and approved.
+    is_approved: bool,
     /// Outcome, and the end of the motion.
     ended: Option<(StepOutcome, Duration)>,
     after: Option<Arc<Heightmap>>,
@@ -81,6 +85,9 @@ impl Lesson {
     pub fn phase(&self) -> LessonPhase {
         match &self.trial {
             None => LessonPhase::Choosing,
+            Some(Trial {
+                is_approved: false, ..
+            }) => LessonPhase::Planning,
             Some(Trial { ended: None, .. }) => LessonPhase::Moving,
             Some(Trial { after: None, .. }) => LessonPhase::Looking,
             Some(_) => LessonPhase::Judging,
@@ -105,6 +112,7 @@ impl Lesson {
         }
         let (reason, advice) = match self.phase() {
             LessonPhase::Choosing => ("Nothing has been shown.", "Choose pick and place first."),
+            LessonPhase::Planning => ("The executor plans the motion.", "Wait a moment."),
             LessonPhase::Moving => ("The arm is moving.", "Wait until it is back, or stop it."),
             LessonPhase::Looking => (
                 "The cameras have not shown the result yet.",
@@ -140,10 +148,28 @@ impl Lesson {
             proposal,
             before: Arc::clone(&before.heightmap),
             undoes,
+            is_approved: false,
             ended: None,
             after: None,
         });
         Ok(())
+    }
+
+    /// The motion that was begun is approved.
+    pub fn approve(&mut self) {
+        if let Some(trial) = &mut self.trial {
+            trial.is_approved = true;
+        }
+    }
+
+    /// The motion that was begun has not been approved: it is as though it was never asked for.
+    pub fn forget(&mut self) {
+        self.trial = None;
+    }
+
+    /// The motion that was approved is not carried out.
+    pub fn forget_motion(&mut self) {
+        self.trial.take_if(|trial| trial.ended.is_none());
     }
 
     /// Step number and attempt of the next motion.
@@ -161,7 +187,10 @@ impl Lesson {
         }
         match result.outcome {
             StepOutcome::Refused | StepOutcome::Rejected => self.trial = None,
-            outcome => trial.ended = Some((outcome, result.stamp)),
+            outcome => {
+                trial.is_approved = true;
+                trial.ended = Some((outcome, result.stamp));
+            }
         }
     }
 

@@ -195,6 +195,8 @@ impl Active for ConsoleNode {
         presence.set_missed_tick_behavior(MissedTickBehavior::Delay);
         loop {
             tokio::select! {
+                // What an operator has decided goes before what is shown.
+                biased;
                 _ = presence.tick() => self.publish_presence(node),
                 Some(command) = commands.recv() => self.carry_out(node, command),
                 message = heightmaps.recv() => {
@@ -212,14 +214,14 @@ impl Active for ConsoleNode {
                         proposals.reject(reason);
                     }
                 }
-                message = confirmations.recv() => console.change(|state, _| state.on_confirmation(&message)),
+                message = confirmations.recv() => console.change(|state, now| state.on_confirmation(&message, now)),
                 message = results.recv() => {
                     if let Err(reason) = console.change(|state, now| state.on_result(&message, now)) {
                         results.reject(reason);
                     }
                 }
                 message = motions.recv() => {
-                    if let Err(reason) = console.change(|state, _| state.run.on_planned_motion(message)) {
+                    if let Err(reason) = console.change(|state, now| state.on_planned_motion(message, now)) {
                         motions.reject(reason);
                     }
                 }
@@ -403,7 +405,7 @@ impl ConsoleNode {
                         Ok(answer) if answer.success => {
                             if answer.needs_approval {
                                 let id = answer.proposal_id;
-                                console.change(|state, _| state.approve_home(id, name));
+                                console.change(|state, now| state.approve_home(id, name, now));
                             }
                             return;
                         }

@@ -1,5 +1,6 @@
 //! The run as the operator sees it: messages in, a snapshot out. No clock, no node.
 
+mod answer;
 mod decide;
 mod health;
 mod outcome;
@@ -19,6 +20,7 @@ use msgs::sensor_msgs::Image;
 use serde::Serialize;
 use step_protocol::StepOutcome;
 
+use self::answer::Unanswered;
 use self::health::{NodeHealth, Robot};
 use self::view::{TableChange, check_heightmap, contains};
 use crate::preview::{Motion, Scores};
@@ -35,7 +37,7 @@ const STEPS: usize = 64;
 const NOTICES: usize = 50;
 /// Proposals whose status is remembered: one may be published again.
 const PROPOSALS: usize = 256;
-/// Heightmaps of which the proposals may still come.
+/// Heightmaps of which the proposals may still come, and planned motions of which they may.
 const HEIGHTMAPS: usize = 8;
 /// Longest description of a robot that is taken (bytes).
 const LONGEST_DESCRIPTION: usize = 1 << 20;
@@ -129,8 +131,10 @@ pub struct Run {
     robot: Robot,
     joints: Option<(Duration, Vec<String>, Vec<f64>)>,
     reward: Option<Reward>,
-    /// The newest planned motion.
-    motion: Option<Motion>,
+    /// The newest planned motions, one for each proposal.
+    motions: VecDeque<Motion>,
+    /// The newest decision that nothing has come of yet.
+    unanswered: Option<Unanswered>,
     /// The newest score maps.
     scores: Option<Arc<Scores>>,
     score_count: u64,
@@ -168,7 +172,8 @@ impl Run {
             robot: Robot::default(),
             joints: None,
             reward: None,
-            motion: None,
+            motions: VecDeque::new(),
+            unanswered: None,
             scores: None,
             score_count: 0,
             robot_description: None,
@@ -240,6 +245,7 @@ impl Run {
         self.goal_view = Some(view);
         self.goal = Some(message);
         self.stopped = false;
+        self.unanswered = None;
         Ok(())
     }
 
@@ -285,7 +291,13 @@ impl Run {
 
     /// The executor has planned the motion of a proposal.
     pub fn on_planned_motion(&mut self, message: PlannedMotion) -> Result<(), InvalidMessage> {
-        self.motion = Some(Motion::from_msg(message)?);
+        let motion = Motion::from_msg(message)?;
+        self.motions
+            .retain(|known| known.proposal_id != motion.proposal_id);
+        if self.motions.len() == HEIGHTMAPS {
+            self.motions.pop_front();
+        }
+        self.motions.push_back(motion);
         Ok(())
     }
 
@@ -315,10 +327,14 @@ impl Run {
 
     /// The planned motion of the present proposal.
     pub fn motion(&self) -> Option<&Motion> {
-        let id = self.current_id()?;
-        self.motion
-            .as_ref()
-            .filter(|motion| motion.proposal_id == id)
+        self.motion_of(self.current_id()?)
+    }
+
+    /// The planned motion of a proposal.
+    pub fn motion_of(&self, proposal_id: u64) -> Option<&Motion> {
+        self.motions
+            .iter()
+            .find(|motion| motion.proposal_id == proposal_id)
     }
 
     /// The scores of the heightmap that the present proposal was made from.
@@ -357,6 +373,8 @@ impl Run {
     /// The proposal for the present goal that the arm moves or has moved for; else the newest, if it is for this goal.
     fn current(&self) -> Option<&Offered> {
         let goal = self.goal.as_ref()?;
+        let since = duration(&goal.header.stamp).ok();
+        // A demonstration that is repeated has the same steps again: what was seen before its goal is of the time before.
         let of_this_goal = |known: &&Offered| {
             let PickPlace {
                 step,
@@ -365,6 +383,7 @@ impl Run {
                 ..
             } = &known.message;
             (*step, *attempt, problem) == (goal.step, goal.attempt, &goal.problem)
+                && duration(&known.message.header.stamp).ok() >= since
         };
         let offered = || self.offered.iter().rev().filter(of_this_goal);
         let at_work = |known: &&Offered| !matches!(known.status, Status::Open | Status::Closed);

@@ -35,7 +35,7 @@ pub use self::access::Access;
 /// Largest body of a request [bytes].
 const LARGEST_BODY: usize = 16 * 1024;
 /// Viewers are told of changes at most this often.
-const SHORTEST_PERIOD: Duration = Duration::from_millis(40);
+const SHORTEST_PERIOD: Duration = Duration::from_millis(20);
 /// Ages are told anew this often.
 const LONGEST_PERIOD: Duration = Duration::from_secs(1);
 
@@ -195,7 +195,10 @@ async fn make_snapshots(
         }
         tokio::time::sleep(SHORTEST_PERIOD).await;
         let _ = tokio::time::timeout(LONGEST_PERIOD, version.changed()).await;
-        console.change_quietly(|state, now| state.sessions.expire(now));
+        console.change_quietly(|state, now| {
+            state.sessions.expire(now);
+            state.ask_again(now);
+        });
     }
 }
 

@@ -3,13 +3,24 @@
 use std::time::Duration;
 
 use bags::Demonstration;
-use msgs::sctn_msgs::{PrimitiveSettings, StepConfirmation};
+use msgs::sctn_msgs::{PlannedMotion, PrimitiveSettings, StepConfirmation};
 
 use super::{Command, State};
 use crate::lesson::Lesson;
-use crate::refusal::Refusal;
-use crate::run::{Decision, Phase, Pose};
+use crate::refusal::{Refusal, advice};
+use crate::run::{Decision, InvalidMessage, Phase, Pose};
 use crate::session::ViewerId;
+
+/// The executor plans a motion in this time.
+const PLANNED_WITHIN: Duration = Duration::from_secs(5);
+
+/// A motion of the lesson that the executor has not planned yet.
+pub(super) struct Planning {
+    proposal_id: u64,
+    /// Who has asked for it.
+    viewer: ViewerId,
+    since: Duration,
+}
 
 impl State {
     /// The operator begins a lesson.
@@ -33,6 +44,7 @@ impl State {
     pub fn end_lesson(&mut self, viewer: ViewerId) -> Result<(), Refusal> {
         self.sessions.check_operator(viewer)?;
         self.lesson = None;
+        self.planning = None;
         Ok(())
     }
 
@@ -43,7 +55,7 @@ impl State {
             .ok_or_else(|| Refusal::new("No lesson is being given.", "Begin a lesson first."))
     }
 
-    /// The operator shows a step: it is proposed and approved at once, and passes the executor's checks as every proposal does.
+    /// The operator shows a step: it is proposed, approved as soon as the executor has planned it, and passes the executor's checks as every proposal does.
     ///
     /// # Errors
     /// When somebody else decides, the last motion is not judged, something is stale, or a pose lies outside the workspace.
@@ -88,12 +100,86 @@ impl State {
         self.send(Command::Propose(Box::new(proposal.clone())))?;
         // Its poses and settings were checked.
         let _ = self.run.on_proposal(proposal);
-        self.confirm(StepConfirmation {
+        self.planning = Some(Planning {
             proposal_id: id,
-            decision: Decision::Approve.to_msg(),
-            operator_name: self.sessions.name(viewer).to_owned(),
-            ..StepConfirmation::default()
-        })
+            viewer,
+            since: now,
+        });
+        Ok(())
+    }
+
+    /// The executor has planned a motion. That of the lesson is approved; where it cannot be planned, the lesson goes on without.
+    ///
+    /// # Errors
+    /// Names the field that makes no sense.
+    pub fn on_planned_motion(
+        &mut self,
+        message: PlannedMotion,
+        now: Duration,
+    ) -> Result<(), InvalidMessage> {
+        let (id, reason) = (message.proposal_id, message.reason.clone());
+        self.run.on_planned_motion(message)?;
+        let Some(Planning { viewer, .. }) = self.planning.take_if(|asked| asked.proposal_id == id)
+        else {
+            return Ok(());
+        };
+        let refusal = if !reason.is_empty() {
+            Refusal::new(
+                format!("The motion cannot be planned: {reason}."),
+                advice(&reason),
+            )
+        } else if let Err(refusal) = self.sessions.check_operator(viewer) {
+            refusal
+        } else {
+            let approval = StepConfirmation {
+                proposal_id: id,
+                decision: Decision::Approve.to_msg(),
+                operator_name: self.sessions.name(viewer).to_owned(),
+                ..StepConfirmation::default()
+            };
+            match self.confirm(approval, now) {
+                Ok(()) => {
+                    if let Some(lesson) = &mut self.lesson {
+                        lesson.approve();
+                    }
+                    return Ok(());
+                }
+                Err(refusal) => refusal,
+            }
+        };
+        self.forget_trial(refusal, now);
+        Ok(())
+    }
+
+    /// Nothing is approved any more by itself.
+    pub(super) fn drop_planning(&mut self) {
+        if self.planning.take().is_some()
+            && let Some(lesson) = &mut self.lesson
+        {
+            lesson.forget();
+        }
+    }
+
+    /// Forgets a motion of the lesson that the executor has not planned. Returns whether there was one.
+    pub(super) fn give_planning_up(&mut self, now: Duration) -> bool {
+        let late = |asked: &mut Planning| now.saturating_sub(asked.since) > PLANNED_WITHIN;
+        if self.planning.take_if(late).is_none() {
+            return false;
+        }
+        let refusal = Refusal::new(
+            "The executor has not planned the motion: nothing has moved.",
+            "Look whether suction_executor is active, then carry it out again.",
+        );
+        self.forget_trial(refusal, now);
+        true
+    }
+
+    fn forget_trial(&mut self, refusal: Refusal, now: Duration) {
+        if let Some(lesson) = &mut self.lesson {
+            lesson.forget();
+        }
+        self.run
+            .note("refusal", refusal.reason, refusal.advice, now);
     }
 
     /// The operator says whether the step that was shown is as it should be.

@@ -52,6 +52,8 @@ fn proposed() -> (Console, ViewerId, mpsc::UnboundedReceiver<Command>) {
             ..PickPlace::default()
         };
         state.run.on_proposal(proposal).unwrap();
+        let planned = crate::preview::tests::planned(7);
+        state.on_planned_motion(planned, now).unwrap();
         ada
     });
     (console, ada, commands)
@@ -72,8 +74,6 @@ pub(crate) fn with_everything() -> Console {
         state.on_result(&result, now).unwrap();
         state.on_heightmap(heightmap(), now).unwrap();
         state.run.on_reward(Default::default());
-        let planned = crate::preview::tests::planned(7);
-        state.run.on_planned_motion(planned).unwrap();
         let scores = msgs::sensor_msgs::Image {
             height: 1,
             width: 2,
@@ -186,7 +186,7 @@ fn our_own_confirmation_that_comes_back_late_changes_nothing() {
     console
         .change(|state, now| state.on_result(&refused, now))
         .unwrap();
-    console.change(|state, _| state.on_confirmation(&confirmation));
+    console.change(|state, now| state.on_confirmation(&confirmation, now));
     decide(&console, ada, 7, Decision::Approve).unwrap();
 }
 
@@ -244,6 +244,12 @@ fn a_lesson_is_shown_judged_taken_back_and_becomes_a_demonstration() {
         let Ok(Command::Propose(proposal)) = commands.try_recv() else {
             panic!("expected a proposal");
         };
+        // Nothing is approved before the executor knows the proposal.
+        assert!(commands.try_recv().is_err());
+        console.change(|state, now| {
+            let planned = crate::preview::tests::planned(proposal.id);
+            state.on_planned_motion(planned, now).unwrap();
+        });
         let Ok(Command::Confirm(approval)) = commands.try_recv() else {
             panic!("expected its approval");
         };
@@ -315,4 +321,51 @@ fn a_lesson_is_shown_judged_taken_back_and_becomes_a_demonstration() {
     assert_eq!(library.picture("three_blocks", 1).unwrap().height_m, [1.0]);
     assert!(library.picture("three_blocks", 2).is_err());
     assert!(library.picture("../three_blocks", 0).is_err());
+}
+
+#[test]
+fn a_motion_of_a_lesson_that_cannot_be_planned_is_not_approved_and_the_lesson_goes_on() {
+    let (console, ada, mut commands) = proposed();
+    let pose = |x_m| Pose {
+        x_m,
+        y_m: 0.5,
+        yaw_rad: 0.0,
+    };
+    let settings = convert::settings_to_msg(&pick_place::PrimitiveSettings::RIGID);
+    console.change(|state, _| state.begin_lesson(ada)).unwrap();
+    let mut shown = |x_m| {
+        console
+            .change(|state, now| state.show_step(ada, pose(x_m), pose(0.8), settings, now))
+            .unwrap();
+        let Ok(Command::Propose(proposal)) = commands.try_recv() else {
+            panic!("expected a proposal");
+        };
+        proposal.id
+    };
+    let noted = |console: &Console| {
+        let json: serde_json::Value =
+            serde_json::from_str(&console.snapshot(None).unwrap()).unwrap();
+        let notices = json["notices"].as_array().unwrap();
+        notices.last().unwrap()["reason"].to_string()
+    };
+    let mut motion = crate::preview::tests::planned(shown(0.2));
+    motion.reason = "pick is out of reach".into();
+    console
+        .change(|state, now| state.on_planned_motion(motion, now))
+        .unwrap();
+    assert!(noted(&console).contains("out of reach"));
+    // The next one is never planned.
+    let id = shown(0.3);
+    let later =
+        |seconds| console.change(|state, now| state.ask_again(now + Duration::from_secs(seconds)));
+    assert!(!later(1));
+    assert!(later(6));
+    assert!(noted(&console).contains("has not planned"));
+    // Then it is, too late.
+    let motion = crate::preview::tests::planned(id);
+    console
+        .change(|state, now| state.on_planned_motion(motion, now))
+        .unwrap();
+    shown(0.4);
+    assert!(commands.try_recv().is_err());
 }

@@ -112,11 +112,34 @@ impl Run {
             return Err(out_of_phase(phase));
         }
         if decision == Decision::Approve
-            && let Some(refusal) = self.obstacle(now).or_else(|| self.change())
+            && let Some(refusal) = self.staleness(now).or_else(|| self.unplanned())
         {
             return Err(refusal);
         }
         Ok(())
+    }
+
+    /// Why what is shown may not be what is there.
+    pub(super) fn staleness(&self, now: Duration) -> Option<Refusal> {
+        self.obstacle(now).or_else(|| self.change())
+    }
+
+    /// Why the present proposal cannot be approved yet, or not at all: an executor that has not planned it does not know it, and
+    /// an approval would be lost.
+    fn unplanned(&self) -> Option<Refusal> {
+        let Some(motion) = self.motion() else {
+            return Some(Refusal::new(
+                "The executor has not planned the motion yet.",
+                "Wait a moment. If it stays so, look whether suction_executor is active.",
+            ));
+        };
+        let reason = &motion.reason;
+        (!reason.is_empty()).then(|| {
+            Refusal::new(
+                format!("The motion cannot be planned: {}", sentence(reason)),
+                advice(reason),
+            )
+        })
     }
 
     /// Why the present proposal is stale: the table has changed since the heightmap that it was made from.
@@ -136,8 +159,15 @@ impl Run {
 
     /// Why nothing can be approved: something is stale, or the robot is not ready.
     pub(super) fn obstacle(&self, now: Duration) -> Option<Refusal> {
+        let executor = self.watch.executor.trim_start_matches('/');
         for stream in self.streams(now) {
             if stream.required && stream.stale {
+                if stream.name == executor && stream.age_s.is_none() {
+                    return Some(Refusal::new(
+                        format!("No executor is there: nothing has come from {executor} yet."),
+                        "Start it, or wait until it is ready; the buttons come back by themselves.",
+                    ));
+                }
                 let reason = match stream.age_s {
                     Some(age_s) => format!(
                         "{} is stale: the newest is {age_s:.1} s old, expected at most {:.1} s.",

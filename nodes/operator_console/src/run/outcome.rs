@@ -6,17 +6,19 @@ use msgs::convert;
 use msgs::sctn_msgs::{ConfirmationRefused, StepConfirmation, StepResult};
 use step_protocol::{ProposalStatus, StepOutcome};
 
+use super::answer::Unanswered;
 use super::{Decision, InvalidMessage, PastStep, Run, STEPS, Status, duration};
 use crate::refusal::{advice, advice_for, advice_of_oracle};
 
 impl Run {
     /// An operator has decided, here or elsewhere.
-    pub fn on_confirmation(&mut self, message: &StepConfirmation) {
+    pub fn on_confirmation(&mut self, message: &StepConfirmation, now: Duration) {
         let Some(decision) = Decision::from_msg(message.decision) else {
             return;
         };
         if decision == Decision::Stop {
             self.stopped = self.goal.as_ref().is_some_and(|goal| !goal.complete);
+            self.unanswered = None;
             return;
         }
         if let (Decision::Advance | Decision::Retry, Some(step)) = (
@@ -29,14 +31,21 @@ impl Run {
             step.decided_by.clone_from(&message.operator_name);
         }
         if let Some(offered) = self.offered(message.proposal_id) {
-            offered.status = match (decision, &offered.status) {
+            let status = match (decision, &offered.status) {
                 (Decision::Approve, Status::Open) => Status::Approved,
                 (Decision::Reject, Status::Open) => Status::Closed,
                 (Decision::Advance | Decision::Retry, Status::Moved { fault }) => {
                     Status::Confirmed { fault: *fault }
                 }
-                (_, status) => status.clone(),
+                _ => return,
             };
+            let before = std::mem::replace(&mut offered.status, status);
+            self.unanswered = Some(Unanswered {
+                proposal_id: message.proposal_id,
+                decision,
+                before,
+                since: now,
+            });
         }
     }
 
@@ -44,6 +53,9 @@ impl Run {
     pub fn on_result(&mut self, message: &StepResult, now: Duration) -> Result<(), InvalidMessage> {
         let result = convert::result_from_msg(message).map_err(|error| error.to_string())?;
         let id = message.proposal_id;
+        // What is said of a rejection or of the next step is the oracle's to answer.
+        self.unanswered
+            .take_if(|asked| asked.proposal_id == id && asked.decision == Decision::Approve);
         match result.outcome {
             StepOutcome::Refused => {
                 let carried_out = result.was_carried_out();
@@ -148,6 +160,8 @@ impl Run {
 
     /// The oracle has refused a decision on a step that was carried out: it has changed nothing.
     pub fn on_confirmation_refused(&mut self, message: &ConfirmationRefused, now: Duration) {
+        self.unanswered
+            .take_if(|asked| asked.proposal_id == message.proposal_id);
         match message.reason {
             // The question is still open.
             ConfirmationRefused::UNKNOWN => {

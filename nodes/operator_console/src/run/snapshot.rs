@@ -18,6 +18,8 @@ pub struct Snapshot<'a> {
     pub phase: Phase,
     pub headline: String,
     pub advice: &'static str,
+    /// What is shown may not be what is there.
+    pub stale: bool,
     pub refused: BTreeMap<Decision, Refusal>,
     pub heightmap: Option<ViewState>,
     pub goal: Option<GoalState<'a>>,
@@ -182,6 +184,7 @@ impl Run {
             phase,
             headline,
             advice,
+            stale: self.staleness(now).is_some(),
             refused: refusals.collect(),
             heightmap: self.present().map(|view| ViewState {
                 age_s: since(view.arrived),

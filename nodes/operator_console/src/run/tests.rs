@@ -1,4 +1,5 @@
 use super::*;
+use crate::preview::tests::planned;
 use msgs::diagnostic_msgs::DiagnosticArray;
 use msgs::diagnostic_msgs::{DiagnosticStatus, KeyValue};
 use msgs::geometry_msgs::Pose2D;
@@ -149,6 +150,7 @@ fn proposed() -> Run {
     run.on_heightmap(heightmap(10, 0.0), NOW).unwrap();
     run.on_goal(goal(1, 0, 0), NOW).unwrap();
     run.on_proposal(proposal(7, 1, 0, 10)).unwrap();
+    run.on_planned_motion(planned(7)).unwrap();
     run
 }
 
@@ -162,7 +164,7 @@ fn a_run_goes_from_proposal_to_approval_motion_confirmation_and_its_end() {
     run.on_proposal(proposal(7, 1, 0, 10)).unwrap();
     assert_eq!((run.phase(), run.current_id()), (Phase::Proposed, Some(7)));
     run.check(Decision::Approve, NOW).unwrap();
-    run.on_confirmation(&confirmation(7, Decision::Approve));
+    run.on_confirmation(&confirmation(7, Decision::Approve), NOW);
     assert_eq!(run.phase(), Phase::Moving);
     run.check(Decision::Approve, NOW).unwrap_err();
     run.check(Decision::Stop, NOW).unwrap();
@@ -171,7 +173,7 @@ fn a_run_goes_from_proposal_to_approval_motion_confirmation_and_its_end() {
     assert_eq!(run.phase(), Phase::AwaitingConfirmation);
     run.check(Decision::Advance, NOW).unwrap();
     run.on_heightmap(heightmap(21, 0.1), NOW).unwrap();
-    run.on_confirmation(&confirmation(7, Decision::Advance));
+    run.on_confirmation(&confirmation(7, Decision::Advance), NOW);
     assert_eq!(run.phase(), Phase::AwaitingProposal);
     let (before, after) = run.past_step(1).unwrap();
     assert_eq!((before.unwrap().number, after.unwrap().number), (1, 2));
@@ -194,7 +196,7 @@ fn a_proposal_that_comes_before_its_goal_is_shown_with_it() {
 #[test]
 fn a_refused_approval_opens_the_proposal_again_and_says_why_and_what_to_do() {
     let mut run = proposed();
-    run.on_confirmation(&confirmation(7, Decision::Approve));
+    run.on_confirmation(&confirmation(7, Decision::Approve), NOW);
     let mut refusal = result(7, StepResult::REFUSED, 11);
     refusal.reason = "proposal 7: the observation has changed since".into();
     run.on_result(&refusal, NOW).unwrap();
@@ -208,10 +210,10 @@ fn a_refused_approval_opens_the_proposal_again_and_says_why_and_what_to_do() {
 #[test]
 fn a_refused_advance_asks_again_whether_the_step_succeeded() {
     let mut run = proposed();
-    run.on_confirmation(&confirmation(7, Decision::Approve));
+    run.on_confirmation(&confirmation(7, Decision::Approve), NOW);
     run.on_result(&result(7, StepResult::DROPPED, 20), NOW)
         .unwrap();
-    run.on_confirmation(&confirmation(7, Decision::Retry));
+    run.on_confirmation(&confirmation(7, Decision::Retry), NOW);
     let mut refusal = ConfirmationRefused {
         proposal_id: 7,
         reason: ConfirmationRefused::TWICE,
@@ -248,7 +250,7 @@ fn where_the_executor_says_that_a_proposal_stands_is_where_it_is_shown() {
         (0, Phase::Proposed),
     ] {
         let mut run = proposed();
-        run.on_confirmation(&confirmation(7, Decision::Approve));
+        run.on_confirmation(&confirmation(7, Decision::Approve), NOW);
         run.on_result(&refused(7, status), NOW).unwrap();
         assert_eq!(run.phase(), phase, "status {status}");
     }
@@ -321,7 +323,7 @@ fn who_made_a_proposal_and_how_likely_it_succeeds_is_shown() {
 #[test]
 fn a_rejected_proposal_is_not_open_when_it_is_published_again() {
     let mut run = proposed();
-    run.on_confirmation(&confirmation(7, Decision::Reject));
+    run.on_confirmation(&confirmation(7, Decision::Reject), NOW);
     run.on_result(&result(7, StepResult::REJECTED, 10), NOW)
         .unwrap();
     run.on_proposal(proposal(7, 1, 0, 10)).unwrap();
@@ -334,8 +336,8 @@ fn a_rejected_proposal_is_not_open_when_it_is_published_again() {
 #[test]
 fn a_stop_holds_until_a_goal_is_latched_again() {
     let mut run = proposed();
-    run.on_confirmation(&confirmation(7, Decision::Approve));
-    run.on_confirmation(&confirmation(7, Decision::Stop));
+    run.on_confirmation(&confirmation(7, Decision::Approve), NOW);
+    run.on_confirmation(&confirmation(7, Decision::Stop), NOW);
     assert_eq!(run.phase(), Phase::Stopped);
     run.on_result(&result(7, StepResult::STOPPED, 15), NOW)
         .unwrap();
@@ -351,7 +353,7 @@ fn a_stop_holds_until_a_goal_is_latched_again() {
 #[test]
 fn after_a_fault_the_step_can_be_tried_again() {
     let mut run = proposed();
-    run.on_confirmation(&confirmation(7, Decision::Approve));
+    run.on_confirmation(&confirmation(7, Decision::Approve), NOW);
     run.on_result(&result(7, StepResult::FAULT, 15), NOW)
         .unwrap();
     assert_eq!(run.phase(), Phase::Fault);
@@ -492,7 +494,7 @@ fn a_correction_is_a_proposal_for_the_present_goal_from_the_newest_view() {
         .unwrap_err();
 
     // The policy proposes again once the arm has moved; the operator still judges the corrected step.
-    run.on_confirmation(&confirmation(id, Decision::Approve));
+    run.on_confirmation(&confirmation(id, Decision::Approve), NOW);
     run.correction(pose(0.1, 0.0), pose(0.2, 0.7), "Ada")
         .unwrap_err();
     run.on_result(&result(id, StepResult::PLACED, 20), NOW)
@@ -509,7 +511,7 @@ fn a_stop_without_a_proposal_ends_the_run_without_a_refusal() {
     let mut run = fresh();
     run.on_heightmap(heightmap(10, 0.0), NOW).unwrap();
     run.on_goal(goal(1, 0, 0), NOW).unwrap();
-    run.on_confirmation(&confirmation(0, Decision::Stop));
+    run.on_confirmation(&confirmation(0, Decision::Stop), NOW);
     run.on_result(&result(0, StepResult::REFUSED, 10), NOW)
         .unwrap();
     assert_eq!(run.phase(), Phase::Stopped);
@@ -520,10 +522,6 @@ fn a_stop_without_a_proposal_ends_the_run_without_a_refusal() {
 #[test]
 fn the_planned_motion_and_the_scores_of_another_proposal_are_not_shown() {
     let mut run = proposed();
-    let planned = crate::preview::tests::planned;
-    run.on_planned_motion(planned(6)).unwrap();
-    assert!(run.motion().is_none());
-    run.on_planned_motion(planned(7)).unwrap();
     assert_eq!(run.motion().unwrap().proposal_id, 7);
     let scores = |sec| {
         let mut image = Image {
@@ -543,4 +541,108 @@ fn the_planned_motion_and_the_scores_of_another_proposal_are_not_shown() {
     assert_eq!(run.scores().unwrap().number, 2);
     run.on_proposal(proposal(8, 1, 0, 11)).unwrap();
     assert!(run.motion().is_none() && run.scores().is_none());
+}
+
+#[test]
+fn a_proposal_can_only_be_approved_when_the_executor_has_planned_it() {
+    let mut run = proposed();
+    run.on_proposal(proposal(8, 1, 0, 10)).unwrap();
+    let why = |run: &Run| run.check(Decision::Approve, NOW).unwrap_err().reason;
+    assert!(why(&run).contains("not planned"), "{}", why(&run));
+    run.check(Decision::Reject, NOW).unwrap();
+    let mut motion = planned(8);
+    motion.trajectory.points.clear();
+    motion.reason = "place is out of reach".into();
+    run.on_planned_motion(motion).unwrap();
+    assert!(
+        why(&run).contains("Place is out of reach."),
+        "{}",
+        why(&run)
+    );
+    // The table is shown as it is: nothing is greyed.
+    assert!(!run.snapshot(NOW).stale);
+    // The executor has planned it after all.
+    run.on_planned_motion(planned(8)).unwrap();
+    run.check(Decision::Approve, NOW).unwrap();
+    // The proposal before it stands again.
+    run.on_proposal(proposal(7, 1, 0, 10)).unwrap();
+    run.check(Decision::Approve, NOW).unwrap();
+}
+
+#[test]
+fn a_demonstration_that_is_repeated_before_a_motion_was_confirmed_begins_anew() {
+    let mut run = proposed();
+    run.on_confirmation(&confirmation(7, Decision::Approve), NOW);
+    run.on_result(&result(7, StepResult::PLACED, 20), NOW)
+        .unwrap();
+    assert_eq!(run.phase(), Phase::AwaitingConfirmation);
+    run.on_goal(goal(1, 0, 20), NOW).unwrap();
+    assert_eq!(run.phase(), Phase::AwaitingProposal);
+    run.on_proposal(proposal(8, 1, 0, 21)).unwrap();
+    assert_eq!((run.phase(), run.current_id()), (Phase::Proposed, Some(8)));
+}
+
+#[test]
+fn without_an_executor_the_words_say_so() {
+    let mut run = Run::new(Watch {
+        nodes: vec!["/suction_executor".into()],
+        executor: "/suction_executor".into(),
+        stale_after: Duration::from_secs(3),
+        changes: ChangeRules::default(),
+    });
+    run.on_heightmap(heightmap(10, 0.0), NOW).unwrap();
+    run.on_goal(goal(1, 0, 0), NOW).unwrap();
+    run.on_proposal(proposal(7, 1, 0, 10)).unwrap();
+    let refusal = run.check(Decision::Approve, NOW).unwrap_err();
+    assert!(
+        refusal.reason.contains("No executor is there"),
+        "{refusal:?}"
+    );
+}
+
+#[test]
+fn an_approval_that_the_executor_does_not_carry_out_is_asked_for_again() {
+    let mut run = proposed();
+    let later = |run: &mut Run, seconds, motion: &str| {
+        let now = NOW + Duration::from_secs(seconds);
+        let mut heard = diagnostics("/suction_executor", "motion", motion, "0.5");
+        heard.status[0].values.clear();
+        run.on_diagnostics(heard, now);
+        run.ask_again(now)
+    };
+    run.on_confirmation(&confirmation(7, Decision::Approve), NOW);
+    assert!(!later(&mut run, 1, "at rest"));
+    assert!(!later(&mut run, 20, "carries out proposal 7"));
+    assert_eq!(run.phase(), Phase::Moving);
+    assert!(later(&mut run, 30, "at rest"));
+    assert_eq!(run.phase(), Phase::Proposed);
+    let json = serde_json::to_value(run.snapshot(NOW)).unwrap();
+    let reason = json["notices"][0]["reason"].as_str().unwrap();
+    assert!(reason.contains("not answered the approval"), "{reason}");
+    assert!(!later(&mut run, 40, "at rest"));
+}
+
+#[test]
+fn a_decision_that_the_oracle_does_not_answer_is_asked_for_again() {
+    let late = NOW + Duration::from_secs(6);
+    let mut run = proposed();
+    run.on_confirmation(&confirmation(7, Decision::Reject), NOW);
+    run.on_result(&result(7, StepResult::REJECTED, 11), NOW)
+        .unwrap();
+    assert!(run.ask_again(late));
+    assert_eq!(run.phase(), Phase::Proposed);
+
+    let mut run = proposed();
+    run.on_confirmation(&confirmation(7, Decision::Approve), NOW);
+    run.on_result(&result(7, StepResult::PLACED, 20), NOW)
+        .unwrap();
+    assert!(!run.ask_again(late));
+    run.on_confirmation(&confirmation(7, Decision::Advance), NOW);
+    assert_eq!(run.phase(), Phase::AwaitingProposal);
+    assert!(run.ask_again(late));
+    assert_eq!(run.phase(), Phase::AwaitingConfirmation);
+    // An answer is a goal.
+    run.on_confirmation(&confirmation(7, Decision::Advance), NOW);
+    run.on_goal(goal(2, 0, 20), NOW).unwrap();
+    assert!(!run.ask_again(late));
 }

@@ -27,6 +27,8 @@ impl Executor<'_> {
             Proposed::Repeated => {}
             Proposed::Invalid(reason) => {
                 self.proposals.reject(&reason);
+                // Who looks at it sees why it cannot be approved.
+                self.publish_plan(Err(reason.to_string()), id);
                 if self.gate.is_automatic() {
                     self.report(self.refusal(id, reason.to_string()), None);
                 }

@@ -8,6 +8,7 @@ use step_protocol::{ProposalId, Report, StepOutcome, StepResult};
 use tracing::{error, info, warn};
 
 use super::Executor;
+use super::motion::Cause;
 
 impl Executor<'_> {
     /// A refusal with where the proposal stands.
@@ -73,6 +74,14 @@ impl Executor<'_> {
             None => (Level::Ok, "ready".to_owned()),
             Some(obstacle) => (Level::Warn, obstacle),
         };
-        self.node.diagnostics().set("driver", level, message, []);
+        let diagnostics = self.node.diagnostics();
+        diagnostics.set("driver", level, message, []);
+        // What an operator's approval has led to.
+        let motion = match self.motion.as_ref().map(|motion| motion.cause) {
+            None => "at rest".to_owned(),
+            Some(Cause::Home(_)) => "goes home".to_owned(),
+            Some(Cause::Proposal(id)) => format!("carries out proposal {id}"),
+        };
+        diagnostics.set("motion", Level::Ok, motion, []);
     }
 }

@@ -20,7 +20,8 @@ pub struct Arranging {
     /// Where objects start that do not say so themselves.
     #[serde(default, skip_serializing_if = "Option::is_none")]
     pub start: Option<Start>,
-    /// Where objects belong, one reward each.
+    /// Where objects belong, one reward each. Without goals the scene is one to be taught in: it is never complete.
+    #[serde(default)]
     pub goals: Vec<Goal>,
     /// How far an object may be from its goal in the plane, in m.
     #[serde(default = "tolerance_m")]

@@ -627,13 +627,9 @@ fn check_lengths(description: &Arranging) -> Result<(), ParameterError> {
     )?;
     check_range("pick_spread_m", description.pick_spread_m, 0.0, 0.02)?;
     check_range("gap_m", description.gap_m, 0.0, 0.1)?;
-    for (list, count) in [
-        ("objects", description.objects.len()),
-        ("goals", description.goals.len()),
-    ] {
-        if count == 0 {
-            return Err(field(list, "is empty, expected at least one".into()));
-        }
+    if description.objects.is_empty() {
+        let reason = "is empty, expected at least one";
+        return Err(field("objects", reason.into()));
     }
     let fixtures = description.fixtures.iter().enumerate();
     let shapes = fixtures.map(|(index, fixture)| (format!("fixtures[{index}]"), &fixture.shape));

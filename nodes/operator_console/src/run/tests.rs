@@ -163,6 +163,8 @@ fn a_run_goes_from_proposal_to_approval_motion_confirmation_and_its_end() {
     assert_eq!(run.phase(), Phase::AwaitingProposal);
     run.on_proposal(proposal(7, 1, 0, 10)).unwrap();
     assert_eq!((run.phase(), run.current_id()), (Phase::Proposed, Some(7)));
+    run.check(Decision::Approve, NOW).unwrap_err();
+    run.on_planned_motion(planned(7)).unwrap();
     run.check(Decision::Approve, NOW).unwrap();
     run.on_confirmation(&confirmation(7, Decision::Approve), NOW);
     assert_eq!(run.phase(), Phase::Moving);
@@ -286,6 +288,7 @@ fn a_proposal_made_before_the_table_changed_is_stale_until_the_table_is_as_it_wa
     run.on_proposal(proposal(8, 1, 0, 13)).unwrap();
     run.check(Decision::Approve, NOW).unwrap_err();
     run.on_proposal(proposal(9, 1, 0, 14)).unwrap();
+    run.on_planned_motion(planned(9)).unwrap();
     run.check(Decision::Approve, NOW).unwrap();
 }
 

@@ -97,6 +97,18 @@ def test_a_late_joiner_gets_the_latched_heightmap_and_goal(start, operator: Oper
     check_heightmap(latched("heightmap", domain))
 
 
+def test_refusals_do_not_end_a_launch_whose_operator_is_elsewhere(start, operator: Operator) -> None:
+    launch = start("sctn", "launch", "--problem", "placing", "--seed", 10008, "--operator", "none")
+    operator.until(operator.executor_is_ready, "executor that has checked its driver", 60.0)
+    proposal = next_proposal(operator, operator.next("goal"))
+    unknown = copy.deepcopy(proposal)
+    unknown.id += 1
+    # One more than an automatic operator takes.
+    for _ in range(6):
+        assert operator.approve(unknown).outcome == StepResult.REFUSED
+    assert operator.approve(proposal).outcome == StepResult.PLACED, launch.log()
+
+
 def latched(topic: str, domain: int) -> Any:
     """What a late joiner gets of a latched topic."""
     with Operator(domain, "late_joiner") as late:

@@ -486,8 +486,8 @@ impl Desk {
                 return Ok(None);
             }
         };
-        if kind == OperatorKind::Web {
-            // The person sees faults and refusals, and decides how to go on.
+        if matches!(kind, OperatorKind::Web | OperatorKind::None) {
+            // Whoever decides, in the page or by topic, sees faults and refusals, and decides how to go on.
             return Ok(self.operator.on_result(result));
         }
         if result.outcome == StepOutcome::Fault {
@@ -496,8 +496,7 @@ impl Desk {
         if result.outcome == StepOutcome::Refused {
             tracing::warn!("proposal {} refused: {}", result.proposal_id, result.reason);
             self.refusals += 1;
-            // Another program that decides may ask what has become of a proposal as often as it likes.
-            if kind != OperatorKind::None && self.refusals >= MAX_REFUSALS {
+            if self.refusals >= MAX_REFUSALS {
                 bail!(
                     "{MAX_REFUSALS} refusals in a row, the last one: {}",
                     result.reason

@@ -1,6 +1,6 @@
 //! The operator's side: which question is due.
 
-use std::collections::{BTreeSet, VecDeque};
+use std::collections::VecDeque;
 
 use crate::mutation::{Mutation, planted};
 use crate::{
@@ -66,8 +66,8 @@ pub struct Operator {
     goal: Option<Goal>,
     /// The newest is the last.
     proposals: VecDeque<Proposal>,
-    /// Of these, those whose last approval was refused.
-    refused: BTreeSet<ProposalId>,
+    /// Of these, those whose last approval was refused; the one that was refused last is the last.
+    refused: Vec<ProposalId>,
     /// Waits for its reward.
     motion: Option<Motion>,
     /// The last motion that a stop or a fault broke off: nothing measures it, and it is asked about on silence only.
@@ -86,7 +86,7 @@ impl Operator {
             has_rewards,
             goal: None,
             proposals: VecDeque::new(),
-            refused: BTreeSet::new(),
+            refused: Vec::new(),
             motion: None,
             broken_off: None,
             confirm: None,
@@ -113,7 +113,8 @@ impl Operator {
         self.proposals.retain(|known| known.id != id);
         if self.proposals.len() == PROPOSALS {
             let oldest = self.proposals.pop_front();
-            oldest.map(|oldest| self.refused.remove(&oldest.id));
+            self.refused
+                .retain(|refused| oldest.as_ref().is_none_or(|oldest| oldest.id != *refused));
         }
         let of_same_goal = |motion: &Motion| {
             let goal = |proposal: &Proposal| (proposal.step, proposal.attempt);
@@ -134,7 +135,8 @@ impl Operator {
         let mut proposals = self.proposals.iter().rev();
         let proposal = proposals.find(|proposal| proposal.id == id)?;
         if refused {
-            self.refused.insert(id);
+            self.refused.retain(|known| *known != id);
+            self.refused.push(id);
         }
         if result.was_carried_out()
             && self
@@ -200,12 +202,12 @@ impl Operator {
                     && proposal.problem == goal.problem
             })
         };
-        let is_refused = |proposal: &&Proposal| self.refused.contains(&proposal.id);
+        let refusal = |proposal: &&Proposal| self.refused.iter().position(|id| *id == proposal.id);
         // Not one that cannot be approved or is for another goal: whoever proposes for this goal has to hear whether the approval
-        // was lost.
+        // was lost. Where all were refused, each is asked about in turn, as each may be of another author.
         let of_goal = || self.proposals.iter().rev().filter(of_goal);
-        let newest = of_goal().find(|proposal| !is_refused(proposal));
-        let newest = newest.or_else(|| of_goal().next());
+        let newest = of_goal().find(|proposal| refusal(proposal).is_none());
+        let newest = newest.or_else(|| of_goal().min_by_key(refusal));
         let newest = newest.or(self.proposals.back()).cloned();
         about_motion
             .into_iter()

@@ -252,8 +252,11 @@ impl ProposalPlanner {
 
     /// The approval of the present proposal was refused.
     fn on_refusal(&mut self, status: Option<ProposalStatus>) {
-        // The executor has forgotten the motion, as it was started again, and may be the only one that could tell of it.
-        if matches!(self.progress, Progress::Closed) && status == Some(ProposalStatus::Pending) {
+        // The executor has forgotten the motion or the stop, as it was started again, and may be the only one that could tell of it.
+        let forgotten = [ProposalStatus::Pending, ProposalStatus::Superseded];
+        if matches!(self.progress, Progress::Closed)
+            && status.is_some_and(|status| forgotten.contains(&status))
+        {
             self.revision += 1;
             self.progress = Progress::Waiting;
             return;

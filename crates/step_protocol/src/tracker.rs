@@ -15,6 +15,8 @@ use crate::{
 
 /// Proposal ids that are remembered as seen.
 const MAX_SEEN: usize = 100_000;
+/// Attempts that are taken from proposals: higher ones are not those of an earlier life.
+const MAX_ATTEMPTS: u32 = 1000;
 /// No sequence is taught longer than this: every goal holds a heightmap.
 const MAX_GOALS: usize = 1000;
 
@@ -168,8 +170,8 @@ pub struct GoalTracker {
     /// Proposals of earlier goals and for other ones.
     seen: BTreeSet<ProposalId>,
     judge: StepJudge,
-    /// The highest attempt of each step that was published with the present stamp: a step that comes again before anything
-    /// has moved needs another one, or its proposals would be taken for the old ones.
+    /// The highest attempt of each step that was published, or that somebody has proposed for, with the present stamp: a step
+    /// that comes again before anything has moved needs another one, or its proposals would be taken for the old ones.
     attempts: BTreeMap<usize, u32>,
     /// The end of the last motion, completed or stopped.
     moved_until: Duration,
@@ -322,10 +324,29 @@ impl GoalTracker {
         let was_stopped = std::mem::take(&mut self.stopped);
         let stamp = self.stamp.max(self.moved_until);
         // While the run was stopped proposals were made from what was seen after the motion; they must not be taken for new ones.
-        let before = self.attempts.get(&index);
-        let before = before.filter(|_| stamp == self.stamp || was_stopped);
-        let attempt = before.map_or(0, |attempt| attempt + 1);
+        let attempt = match stamp == self.stamp || was_stopped {
+            true => self.next_attempt(index),
+            false => 0,
+        };
         self.next_goal(index, attempt, stamp)
+    }
+
+    /// An attempt of a step that has no proposals yet, as long as nothing moves.
+    fn next_attempt(&self, index: usize) -> u32 {
+        let attempt = self.attempts.get(&index);
+        attempt.map_or(0, |attempt| attempt.saturating_add(1))
+    }
+
+    /// A proposal for another goal: this tracker may have published that goal before it was started again.
+    fn remember_attempt(&mut self, proposal: &Proposal) {
+        let index = (proposal.step as usize).wrapping_sub(1);
+        let goal = self.sequence.goals.get(index);
+        if goal.is_some_and(|goal| goal.problem == proposal.problem)
+            && proposal.attempt < MAX_ATTEMPTS
+        {
+            let attempt = self.attempts.entry(index).or_insert(proposal.attempt);
+            *attempt = proposal.attempt.max(*attempt);
+        }
     }
 
     /// Whether all steps are done.
@@ -354,6 +375,7 @@ impl GoalTracker {
             });
         if !of_this_goal {
             self.remember(proposal.id);
+            self.remember_attempt(proposal);
             return;
         }
         if self.seen.contains(&proposal.id) || self.is_current(proposal.id) {
@@ -415,7 +437,7 @@ impl GoalTracker {
             | (StepOutcome::Refused, Some(ProposalStatus::Rejected | ProposalStatus::Withdrawn))
                 if is_of_this_goal && !self.has_moved() =>
             {
-                self.next_goal(self.reached, self.attempt + 1, self.stamp)
+                self.next_goal(self.reached, self.next_attempt(self.reached), self.stamp)
             }
             (StepOutcome::Stopped, _) if self.judge != StepJudge::Operator => Change::None,
             _ if result.arm_moved() => self.on_motion(result),

@@ -283,3 +283,23 @@ fn in_silence_a_proposal_that_was_refused_or_is_for_another_goal_gives_way_to_on
     let asked = operator.on_silence();
     assert_eq!(answer(asked.last().cloned()).0, 7);
 }
+
+#[test]
+fn in_silence_proposals_that_were_all_refused_are_asked_about_in_turn() {
+    let mut operator = Operator::new(true);
+    operator.on_goal(&goal(3, 0));
+    let refused = |id| StepResult {
+        status: Some(ProposalStatus::Superseded),
+        ..result(id, StepOutcome::Refused)
+    };
+    for id in [7, 8] {
+        operator.on_proposal(proposal(id, 10));
+        operator.on_result(refused(id));
+    }
+    // Each may be of another author, who hears of it only in this way.
+    for id in [7, 8, 7] {
+        let asked = operator.on_silence();
+        assert_eq!(answer(asked.last().cloned()).0, id);
+        operator.on_result(refused(id));
+    }
+}

@@ -387,6 +387,23 @@ fn a_proposal_that_somebody_elses_has_superseded_is_made_anew_with_another_id() 
 }
 
 #[test]
+fn a_motion_or_stop_that_the_executor_has_forgotten_leaves_room_for_another_proposal() {
+    for status in [ProposalStatus::Pending, ProposalStatus::Superseded] {
+        let (mut planner, proposal) = proposed();
+        let withdrawn = StepResult {
+            status: Some(ProposalStatus::Withdrawn),
+            ..result(proposal.id, StepOutcome::Stopped)
+        };
+        assert_eq!(planner.on_result(&withdrawn), None);
+        // The executor was started again: all that it knows of the proposal is that it was published.
+        let job = planner.on_result(&refused(proposal.id, status));
+        assert!(job.is_some(), "{status:?}");
+        let (second, _) = planner.on_prediction(Ok(&prediction(0.4)));
+        assert_ne!(second.unwrap().unwrap().id, proposal.id);
+    }
+}
+
+#[test]
 fn a_refused_proposal_is_made_anew_from_the_next_observation_though_nothing_has_changed() {
     let (mut planner, proposal) = proposed();
     planner.on_confirmation(&says(OperatorDecision::Approve, proposal.id));

@@ -201,6 +201,8 @@ struct World {
     foreign_count: u64,
     /// Proposals that the arm has moved for.
     moved: BTreeSet<ProposalId>,
+    /// Of these, those since the executor was started.
+    moved_since_start: BTreeSet<ProposalId>,
     /// Approvals that the executor has received and that still count.
     approvals: Vec<ProposalId>,
     newest_at_gate: Option<ProposalId>,
@@ -307,6 +309,7 @@ impl World {
             published: BTreeMap::new(),
             foreign_count: 0,
             moved: BTreeSet::new(),
+            moved_since_start: BTreeSet::new(),
             approvals: Vec::new(),
             newest_at_gate: None,
             queued: BTreeMap::new(),
@@ -396,6 +399,7 @@ impl World {
             Party::Gate => {
                 // The watchdog stops the arm; nobody reports a result.
                 self.gate = gate();
+                self.moved_since_start.clear();
                 self.approvals.clear();
                 self.newest_at_gate = None;
                 self.home = None;
@@ -696,6 +700,9 @@ impl World {
                     let published = self.published.get(&id);
                     if !published.is_some_and(|published| published.contains(&proposal)) {
                         return violation(format!("{id} moves otherwise than it was published"));
+                    }
+                    if !self.moved_since_start.insert(id) {
+                        return violation(format!("{id} moves twice"));
                     }
                     self.moved.insert(id);
                     self.home = None;

@@ -373,6 +373,22 @@ fn another_step_is_latched_at_a_call_and_no_attempt_is_used_twice_before_somethi
 }
 
 #[test]
+fn a_tracker_that_is_started_again_takes_no_attempt_that_somebody_has_proposed_for() {
+    let mut tracker = tracker(3);
+    // Made before it was started again; the planner would propose the same once more.
+    tracker.on_proposal(&proposal(7, 3, 0));
+    tracker.on_proposal(&proposal(8, 1, 1));
+    assert_eq!(goal(tracker.set_step(3).unwrap()), (3, 1, 0, false));
+    assert_eq!(goal(tracker.set_step(1).unwrap()), (1, 2, 0, false));
+    // Nobody's number ends the attempts.
+    tracker.on_proposal(&proposal(9, 2, u32::MAX));
+    assert_eq!(goal(tracker.set_step(2).unwrap()), (2, 0, 0, false));
+    tracker.on_proposal(&proposal(10, 2, 0));
+    let rejected = result(10, StepOutcome::Rejected, 0);
+    assert_eq!(goal(tracker.on_result(&rejected)), (2, 1, 0, false));
+}
+
+#[test]
 fn a_step_that_is_set_ends_a_stop_and_a_completed_run() {
     let mut tracker = tracker(1);
     tracker.on_proposal(&proposal(7, 1, 0));

@@ -32,8 +32,9 @@ os.environ.setdefault("RMW_IMPLEMENTATION", "rmw_fastrtps_cpp")
 os.environ.setdefault("FASTRTPS_DEFAULT_PROFILES_FILE", str(REPOSITORY / "config/fastdds.xml"))
 
 import numpy as np
+from action_msgs.msg import GoalStatusArray
 from cell_operator import EVENT, LATCHED, STREAM, Operator
-from fault_monitor import Monitor
+from fault_monitor import Kind, Monitor, Violation
 from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter
 from sctn_msgs.msg import Heightmap, PickPlace, PlannedMotion, StepConfirmation, StepResult
@@ -55,8 +56,17 @@ LATEST_S = 3.0
 FAULTS_OF_A_CELL = 8
 # The arm has moved when a joint is so much further [rad].
 MOVED_RAD = 0.02
+# So long a proposal waits for its approval: the arm must not move.
+UNDECIDED_S = 0.4
+# A second executor has found out by then that there is one.
+LISTENING_S = 2.0
 # Output that switches suction: suction_pin of the executor.
 SUCTION_PIN = 16
+# The driver's action.
+FOLLOW_ACTION = "scaled_joint_trajectory_controller/follow_joint_trajectory"
+
+
+Fault = Callable[["Bench"], None]
 
 
 @dataclasses.dataclass
@@ -71,6 +81,8 @@ class Bench:
     # The newest proposal, which moves the arm when a fault comes.
     proposal: PickPlace | None = None
     suction: bool = False
+    # When something was done that exposes a fault of the executor: a proposal, an injected fault [s].
+    exposed_s: list[float] = dataclasses.field(default_factory=list)
 
     def positions(self) -> list[float]:
         """Where the joints are [rad]."""
@@ -79,6 +91,10 @@ class Bench:
     def has_moved(self, before: list[float]) -> bool:
         """Whether the arm has left a place."""
         return max(abs(a - b) for a, b in zip(self.positions(), before, strict=True)) > MOVED_RAD
+
+    def exposed_by(self, now: float) -> float:
+        """The last time before now at which something was done that exposes a fault [s]."""
+        return max((time_s for time_s in self.exposed_s if time_s <= now), default=now)
 
     def stopped(self, limit_s: float) -> None:
         self.monitor.on_stop(time.monotonic(), limit_s)
@@ -120,7 +136,7 @@ def freeze_executor(bench: Bench) -> None:
     bench.executor.signal(signal.SIGCONT)
 
 
-def robot(fault: str) -> Callable[[Bench], None]:
+def robot(fault: str) -> Fault:
     """A fault of the robot. It acts at some time of the call that sets it."""
 
     def inject(bench: Bench) -> None:
@@ -136,6 +152,8 @@ def spoofed_approvals(bench: Bench) -> None:
     for proposal_id in (123_456_789, bench.proposal.id, 0):
         bench.operator.confirm(proposal_id, StepConfirmation.APPROVE)
     stop(bench)
+    # The arm rests, and the executor has said so.
+    bench.operator.spin(0.6)
     for proposal_id in (123_456_789, bench.proposal.id, 0):
         bench.operator.confirm(proposal_id, StepConfirmation.APPROVE)
 
@@ -144,15 +162,19 @@ def superseded_approval(bench: Bench) -> None:
     """After a stop the approval of a proposal that was replaced moves nothing."""
     stop(bench)
     bench.operator.spin(0.5)
-    old = bench.cell.propose(bench.cell.observe())
-    bench.cell.propose(bench.cell.observe())
+    old = propose(bench.cell)
+    propose(bench.cell)
+    # The monitor has to know of both.
+    bench.operator.spin(0.2)
     bench.operator.confirm(old.id, StepConfirmation.APPROVE)
 
 
 def another_executor(bench: Bench) -> None:
     """A second executor in mid-motion, then a stop and an approval of the old proposal: neither moves the arm."""
-    bench.start("suction_executor", *arguments("suction_executor"))
-    bench.operator.spin(0.3)
+    second = bench.start("suction_executor", *arguments("suction_executor"))
+    end = time.monotonic() + LISTENING_S
+    while second.exit_code is None and time.monotonic() < end:
+        bench.operator.spin(0.05)
     stop(bench)
     bench.operator.confirm(bench.proposal.id, StepConfirmation.APPROVE)
 
@@ -168,6 +190,7 @@ def unapproved_way_home(bench: Bench) -> None:
     stop(bench)
     bench.operator.spin(0.5)
     propose_home(bench)
+    bench.operator.spin(UNDECIDED_S)
     bench.operator.confirm(bench.proposal.id, StepConfirmation.APPROVE)
 
 
@@ -187,21 +210,22 @@ FAULTS = [
     unapproved_way_home,
 ]
 
-# Faults planted in the executor, and what exposes them.
+# Faults planted in the executor: what exposes each, how long after the motion has begun, and what the monitor has to say of it.
 PLANTED = {
-    "MovesUnapproved": stop,
-    "AnyApproval": spoofed_approvals,
-    "ApprovesSuperseded": superseded_approval,
-    "ApprovesTwice": spoofed_approvals,
-    "IgnoresStop": stop,
-    "IgnoresStopOfAnother": stop_naming_no_proposal,
-    "AnswersWithoutCancel": stop,
-    "GoesOnAfterStop": stop,
-    "GoesOnAfterFault": robot("protective_stop"),
-    "DropsOnStop": stop_while_suction_is_on,
-    "HomeUnasked": unapproved_way_home,
-    "NoHeartbeat": kill_executor,
-    "SecondExecutor": another_executor,
+    "MovesUnapproved": (stop, 1.0, Kind.UNAPPROVED),
+    "AnyApproval": (superseded_approval, 1.0, Kind.UNAPPROVED),
+    "ApprovesSuperseded": (superseded_approval, 1.0, Kind.UNAPPROVED),
+    "ApprovesTwice": (spoofed_approvals, 1.0, Kind.UNAPPROVED),
+    "IgnoresStop": (stop, 0.5, Kind.AFTER_STOP),
+    "IgnoresStopOfAnother": (stop_naming_no_proposal, 0.5, Kind.AFTER_STOP),
+    "AnswersWithoutCancel": (stop, 0.5, Kind.AFTER_STOP),
+    "GoesOnAfterStop": (stop, 0.5, Kind.AFTER_STOP),
+    "GoesOnAfterFault": (robot("protective_stop"), 0.5, Kind.AFTER_STOP),
+    "DropsOnStop": (stop_while_suction_is_on, 1.0, Kind.DROPPED),
+    "HomeUnasked": (unapproved_way_home, 1.0, Kind.AFTER_STOP),
+    # The approach takes some 1.4 s: killed in its beginning, it goes on for longer than the watchdog takes.
+    "NoHeartbeat": (kill_executor, 0.2, Kind.AFTER_STOP),
+    "SecondExecutor": (another_executor, 1.0, Kind.TWO_GOALS),
 }
 
 
@@ -235,11 +259,15 @@ def watch(bench: Bench) -> None:
         bench.suction = any(output.pin == SUCTION_PIN and output.state for output in pins.digital_out_states)
         monitor.on_suction(bench.suction, time.monotonic())
 
+    def on_goals(goals: GoalStatusArray) -> None:
+        monitor.on_goals({bytes(one.goal_info.goal_id.uuid): one.status for one in goals.status_list}, time.monotonic())
+
     node = bench.operator.node
     node.create_subscription(PickPlace, "pick_place", lambda made: monitor.on_proposal(made.id), LATCHED)
     node.create_subscription(PlannedMotion, "planned_motion", lambda plan: monitor.on_plan(plan.proposal_id), LATCHED)
     node.create_subscription(StepConfirmation, "step_confirmation", on_confirmation, EVENT)
     node.create_subscription(StepResult, "step_result", on_result, EVENT)
+    node.create_subscription(GoalStatusArray, f"{FOLLOW_ACTION}/_action/status", on_goals, LATCHED)
     node.create_subscription(JointState, "joint_states", lambda read: monitor.on_joints(read.position, time.monotonic()), STREAM)
     node.create_subscription(IOStates, "io_and_status_controller/io_states", on_pins, STREAM)
 
@@ -288,14 +316,18 @@ def begin(bench: Bench) -> str:
     """An approval of a new proposal moves the arm, or is refused for a reason."""
     operator = bench.operator
     bench.proposal = propose(bench.cell)
-    after = operator.count("step_result")
+    bench.exposed_s.append(time.monotonic())
     before = bench.positions()
+    operator.spin(UNDECIDED_S)
+    after = operator.count("step_result")
     operator.confirm(bench.proposal.id, StepConfirmation.APPROVE)
 
     def outcome() -> str | None:
         answers = [result for result in operator.received["step_result"][after:] if result.proposal_id == bench.proposal.id]
         if answers and answers[-1].outcome == StepResult.REFUSED:
             return f"refused: {answers[-1].reason}"
+        if answers:
+            return f"ended with outcome {answers[-1].outcome}: {answers[-1].reason}"
         return "moves" if bench.has_moved(before) else None
 
     return operator.until(outcome, "motion or refusal", 30.0)
@@ -337,9 +369,10 @@ def go_home(bench: Bench) -> bool:
     return end.outcome == StepResult.AT_HOME
 
 
-def inject(bench: Bench, fault: Callable[[Bench], None], moment_s: float) -> str:
+def inject(bench: Bench, fault: Fault, moment_s: float) -> str:
     """Injects a fault so long after the arm has begun to move. Returns how it went on."""
     bench.operator.spin(moment_s)
+    bench.exposed_s.append(time.monotonic())
     fault(bench)
     bench.operator.spin(WATCH_S)
     recover(bench)
@@ -362,92 +395,162 @@ def propose(cell: Cell) -> PickPlace:
     return cell.propose(cell.observe(look))
 
 
-def drawn(count: int, seed: int) -> list[tuple[Callable[[Bench], None], float]]:
+@dataclasses.dataclass(frozen=True)
+class Planned:
+    """A fault that is to be injected so long after a motion has begun."""
+
+    number: int
+    fault: Fault
+    moment_s: float
+
+
+def drawn(count: int, seed: int) -> list[Planned]:
     """So many faults and their moments. Every kind comes once before any comes again."""
     draw = random.Random(seed)
-    kinds: list[Callable[[Bench], None]] = []
+    kinds: list[Fault] = []
     while len(kinds) < count:
         kinds += draw.sample(FAULTS, len(FAULTS))
-    return [(fault, draw.uniform(0.0, LATEST_S)) for fault in kinds[:count]]
+    return [Planned(number, fault, draw.uniform(0.0, LATEST_S)) for number, fault in enumerate(kinds[:count])]
 
 
-def campaign(count: int, seed: int) -> dict[str, object]:
-    """Injects so many faults; prints each with what came of it on standard error."""
-    counts: collections.Counter[str] = collections.Counter()
-    violations: list[str] = []
-    faults = drawn(count, seed)
-    number = 0
-    while number < count:
-        last = min(number + FAULTS_OF_A_CELL, count)
+@dataclasses.dataclass
+class Injected:
+    """What came of a fault: a line of the log."""
+
+    seed: int
+    number: int
+    fault: str
+    moment_s: float
+    # How it went on; empty where it hung.
+    went_on: str
+    hung: str = ""
+    # The kinds and words of what must not happen.
+    violations: list[tuple[str, str]] = dataclasses.field(default_factory=list)
+
+
+def run_cells(faults: list[Planned], seed: int, until_s: float = float("inf")) -> Iterator[Injected]:
+    """Injects faults, some in each cell, until a monotonic time is over; says each with what came of it on standard error."""
+    left = list(faults)
+    while left and time.monotonic() < until_s:
         with working_cell() as bench:
             went_on = begin(bench)
-            while number < last and went_on.startswith(("moves", "resumed")):
-                fault, moment_s = faults[number]
-                name = f"fault {number} of seed {seed}: {fault.__name__} at {moment_s:.2f} s"
-                number += 1
+            for _ in range(FAULTS_OF_A_CELL):
+                if not left or not went_on.startswith(("moves", "resumed")) or time.monotonic() > until_s:
+                    break
+                planned = left.pop(0)
+                line = Injected(seed, planned.number, planned.fault.__name__, round(planned.moment_s, 3), "")
                 known = len(bench.monitor.violations)
                 try:
-                    went_on = inject(bench, fault, moment_s)
+                    line.went_on = went_on = inject(bench, planned.fault, planned.moment_s)
                 except (TimeoutError, AssertionError) as error:
-                    counts["hung"] += 1
-                    print(f"{name}: hung: {error}", file=sys.stderr, flush=True)
-                    break
-                found = bench.monitor.violations[known:]
-                counts["resumed" if went_on.startswith("resumed") else "refused"] += 1
-                counts["unapproved_motions"] += any("without an approval" in violation for violation in found)
-                counts["motions_after_stop"] += any("after it had to stop" in violation for violation in found)
-                counts["dropped_parts"] += any("dropped" in violation for violation in found)
-                violations += [f"{name}: {violation}" for violation in found[:1]]
-                print(f"{name}: {went_on}; {found[:1]}", file=sys.stderr, flush=True)
+                    line.hung = went_on = str(error) or type(error).__name__
+                line.violations = [(found.kind.value, found.text) for found in bench.monitor.violations[known:]][:5]
+                print(f"{json.dumps(dataclasses.asdict(line))}", file=sys.stderr, flush=True)
+                yield line
+
+
+def summed(lines: list[Injected], faults: int, seed: int) -> dict[str, object]:
+    """The result of a campaign."""
+    counts = collections.Counter(kind.value for kind in Kind for line in lines if kind.value in dict(line.violations))
     return {
-        "faults": count,
+        "faults": faults,
         "seed": seed,
-        "runs": count,
-        "resumed": counts["resumed"],
-        "refused": counts["refused"],
-        "unapproved_motions": counts["unapproved_motions"],
-        "motions_after_stop": counts["motions_after_stop"],
-        "dropped_parts": counts["dropped_parts"],
-        "hung_runs": counts["hung"],
-        "violations": violations,
+        "runs": len(lines),
+        "resumed": sum(line.went_on.startswith("resumed") for line in lines),
+        "refused": sum(bool(line.went_on) and not line.went_on.startswith("resumed") for line in lines),
+        **{kind.value: counts[kind.value] for kind in Kind},
+        "hung_runs": sum(bool(line.hung) for line in lines),
+        "violations": [
+            f"fault {line.number} of seed {line.seed}: {line.fault} at {line.moment_s:.2f} s: {line.violations[0][1]}"
+            for line in lines
+            if line.violations
+        ],
     }
 
 
-def planted_campaign(only: str | None = None) -> dict[str, str]:
-    """Runs the executor with each planted fault; what the monitor says of it, nothing where it is missed."""
-    caught: dict[str, str] = {}
-    for planted, fault in PLANTED.items():
+def campaign(count: int, seed: int, log: pathlib.Path | None = None, minutes: float = float("inf")) -> dict[str, object]:
+    """Injects so many faults. With a log, those that are in it are not injected again, and the result is of all of them."""
+    faults = drawn(count, seed)
+    done = read_log(log, faults, seed) if log and log.exists() else []
+    known = {line.number for line in done}
+    until_s = time.monotonic() + 60.0 * minutes
+    for line in run_cells([planned for planned in faults if planned.number not in known], seed, until_s):
+        done.append(line)
+        if log:
+            with log.open("a") as file:
+                print(json.dumps(dataclasses.asdict(line)), file=file)
+    return summed(done, count, seed)
+
+
+def read_log(log: pathlib.Path, faults: list[Planned], seed: int) -> list[Injected]:
+    """The faults of a campaign that were injected before. An error where they are those of another program."""
+    done = []
+    for number, text in enumerate(log.read_text().splitlines(), 1):
+        line = Injected(**json.loads(text))
+        if line.seed != seed or line.number >= len(faults):
+            continue
+        expected = faults[line.number]
+        if (line.fault, line.moment_s) != (expected.fault.__name__, round(expected.moment_s, 3)):
+            raise SystemExit(
+                f"{log}:{number}: fault {line.number} of seed {seed} is {line.fault} at {line.moment_s} s, "
+                f"expected {expected.fault.__name__} at {expected.moment_s:.3f} s: written by another version of the campaign"
+            )
+        done.append(line)
+    return done
+
+
+def planted_campaign(only: str | None = None) -> dict[str, Violation | None]:
+    """Runs the executor with each planted fault; what the monitor says of it, nothing where it is missed or takes it for something else."""
+    caught: dict[str, Violation | None] = {}
+    for planted, (fault, moment_s, expected) in PLANTED.items():
         if only not in (None, planted):
             continue
         with working_cell(planted) as bench:
             try:
-                bench.monitor.violations.clear()
                 begin(bench)
-                inject(bench, fault, 1.0)
+                inject(bench, fault, moment_s)
             except (TimeoutError, AssertionError) as error:
                 print(f"{planted}: the run hangs: {error}", file=sys.stderr, flush=True)
-            caught[planted] = next(iter(bench.monitor.violations), "")
-        print(f"{planted}: {fault.__name__}: {caught[planted] or 'MISSED'}", file=sys.stderr, flush=True)
+            found = bench.monitor.violations
+            # Later ones may be what comes of the first.
+            first = found[0] if found and found[0].kind == expected else None
+            caught[planted] = first
+            said = f"MISSED {list(map(str, found[:1]))}"
+            if first:
+                said = f"{expected.value} after {first.at_s - bench.exposed_by(first.at_s):.2f} s: {first}"
+        print(f"{planted}: {fault.__name__}: {said}", file=sys.stderr, flush=True)
     return caught
+
+
+def same_situations(seed: int) -> list[str]:
+    """What the monitor says of the shipped executor where those with planted faults are caught: nothing."""
+    situations = {fault.__name__: Planned(number, fault, moment_s) for number, (fault, moment_s, _) in enumerate(PLANTED.values())}
+    result = summed(list(run_cells(list(situations.values()), seed)), len(situations), seed)
+    hung = [f"{result['hung_runs']} runs hung"] if result["hung_runs"] else []
+    return [*result["violations"], *hung]
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--faults", type=int, default=20)
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--log", type=pathlib.Path, help="append a line of JSON for each fault; those in the file are left out")
+    parser.add_argument("--minutes", type=float, default=float("inf"), help="end after so long; with --log the next call goes on")
     parser.add_argument("--planted", action="store_true", help="run executors with planted faults: each has to be caught")
-    parser.add_argument("--only", help="with --planted: this fault alone")
+    parser.add_argument("--only", choices=PLANTED, help="with --planted: this fault alone")
     parser.add_argument("--json", action="store_true", help="print the result as one line of JSON")
     given = parser.parse_args()
     if given.planted:
         caught = planted_campaign(given.only)
         missed = [planted for planted, violation in caught.items() if not violation]
-        result = {"planted": len(caught), "caught": len(caught) - len(missed), "missed": missed}
-        print(json.dumps(result) if given.json else "\n".join(f"{name}: {value}" for name, value in result.items()))
-        return 1 if missed else 0
-    result = campaign(given.faults, given.seed)
+        unplanted = [] if given.only else same_situations(given.seed)
+        result = {"planted": len(caught), "caught": len(caught) - len(missed), "missed": missed, "unplanted": unplanted}
+        failed = bool(missed or unplanted)
+    else:
+        result = campaign(given.faults, given.seed, given.log, given.minutes)
+        failed = bool(result["violations"] or result["hung_runs"])
     print(json.dumps(result) if given.json else "\n".join(f"{name}: {value}" for name, value in result.items()))
-    return 1 if result["violations"] or result["hung_runs"] else 0
+    return 1 if failed else 0
 
 
 if __name__ == "__main__":

@@ -1,13 +1,46 @@
-"""An independent monitor of a cell: it reads joints, suction output, proposals and the operator, and nothing of the executor."""
+"""An independent monitor of a cell: it reads joints, suction output, goals, proposals and the operator, and nothing inside the executor."""
 
 from __future__ import annotations
 
 import dataclasses
+import enum
+from collections.abc import Mapping
 
-# A joint moves when it goes further from one reading to the next: encoders have a noise of 2e-5 rad.
+# A joint has moved when it is so much further from where it was last seen to move: encoders have a noise of 2e-5 rad.
 MOVING_RAD = 5e-4
 # By how much messages of different topics may overtake each other.
 OVERTAKING_S = 0.05
+# An arm that has not moved for so long has come to rest: what comes then is another motion.
+REST_TIME_S = 0.2
+# Status of a goal in action_msgs/GoalStatus: accepted, executing and cancelling ones move the arm.
+UNDER_WAY = (1, 2, 3)
+CANCELED, ABORTED = 5, 6
+
+
+class Kind(enum.Enum):
+    """What must not happen."""
+
+    # A motion begins that the deciding operator has not approved.
+    UNAPPROVED = "unapproved_motions"
+    # A motion goes on, or begins again by itself, after a stop.
+    AFTER_STOP = "motions_after_stop"
+    # Suction is switched off after a stop.
+    DROPPED = "dropped_parts"
+    # A goal takes the place of one under way: two executors, or one that does not wait.
+    TWO_GOALS = "replaced_goals"
+
+
+@dataclasses.dataclass
+class Violation:
+    """Something that must not happen has happened."""
+
+    kind: Kind
+    text: str
+    # When it was seen [s].
+    at_s: float
+
+    def __str__(self) -> str:
+        return self.text
 
 
 @dataclasses.dataclass
@@ -15,7 +48,7 @@ class Monitor:
     """Says which motions nobody has approved, which went on after a stop, and what a stop has dropped. Times: one monotonic clock [s]."""
 
     deciding_operator: str
-    violations: list[str] = dataclasses.field(default_factory=list)
+    violations: list[Violation] = dataclasses.field(default_factory=list)
     # How long the arm moved after the last event that had to stop it [s].
     rest_after_s: float = 0.0
     _newest: int | None = None
@@ -24,10 +57,15 @@ class Monitor:
     _used: set[int] = dataclasses.field(default_factory=set)
     # The proposal that may move the arm.
     _moving: int | None = None
+    # Approvals since the last stop that must not move the arm, and why.
+    _void: list[str] = dataclasses.field(default_factory=list)
     _stopped_at: float | None = None
     _limit_s: float = 0.0
     _positions: list[float] | None = None
+    _moved_at: float = 0.0
     _suction: bool = False
+    # Status of each goal of the driver's action.
+    _goals: dict[bytes, int] = dataclasses.field(default_factory=dict)
 
     def on_proposal(self, proposal_id: int) -> None:
         """The newest proposal replaces the one before, but not the one that is being carried out."""
@@ -42,16 +80,23 @@ class Monitor:
 
     def on_approval(self, proposal_id: int, operator: str) -> None:
         """Only the deciding operator's first approval of the newest proposal lets the arm move."""
-        is_offered = proposal_id in (self._newest, self._home)
-        if operator == self.deciding_operator and is_offered and proposal_id not in self._used:
+        if operator != self.deciding_operator:
+            self._void.append(f"the approval of proposal {proposal_id} came from {operator}, who does not decide")
+        elif proposal_id in self._used:
+            self._void.append(f"the approval of proposal {proposal_id} was used before")
+        elif proposal_id not in (self._newest, self._home):
+            self._void.append(f"the approval was of proposal {proposal_id}, which is not the one that is offered")
+        else:
             self._used.add(proposal_id)
             self._moving = proposal_id
             self._stopped_at = None
+            self._void = []
 
     def on_stop(self, now: float, limit_s: float) -> None:
         """A stop, fault or death: the arm has to rest within the limit, until the next approval."""
         if self._stopped_at is None:
             self._stopped_at, self._limit_s, self.rest_after_s = now, limit_s, 0.0
+            self._void = []
 
     def on_end(self, proposal_id: int, now: float) -> None:
         """The executor says that a motion has ended: nothing moves any more."""
@@ -62,19 +107,41 @@ class Monitor:
         """A reading of the output that switches suction: a stop leaves it as it is."""
         was_on, self._suction = self._suction, on
         if was_on and not on and self._stopped_at is not None:
-            self._violate(f"suction is switched off {now - self._stopped_at:.2f} s after a stop: what is held is dropped")
+            text = f"suction is switched off {now - self._stopped_at:.2f} s after a stop: what is held is dropped"
+            self._violate(Kind.DROPPED, text, now)
+
+    def on_goals(self, statuses: Mapping[bytes, int], now: float) -> None:
+        """The statuses of an action's goals: no goal comes while another is under way."""
+        before, self._goals = self._goals, dict(statuses)
+        new = [goal for goal, status in statuses.items() if goal not in before and status in UNDER_WAY]
+        replaced = [goal for goal, status in statuses.items() if status in (CANCELED, ABORTED) and before.get(goal, 1) in UNDER_WAY]
+        under_way = [goal for goal, status in statuses.items() if status in UNDER_WAY]
+        if new and (replaced or len(under_way) > 1):
+            self._violate(Kind.TWO_GOALS, "a goal takes the place of one under way: two executors act on one approval", now)
 
     def on_joints(self, positions: list[float], now: float) -> None:
         """A reading of the joints."""
-        before, self._positions = self._positions, list(positions)
-        if before is None or max(abs(a - b) for a, b in zip(positions, before, strict=True)) <= MOVING_RAD:
+        if self._positions is None:
+            self._positions, self._moved_at = list(positions), now
             return
+        if max(abs(a - b) for a, b in zip(positions, self._positions, strict=True)) <= MOVING_RAD:
+            return
+        rested = now - self._moved_at > REST_TIME_S
+        self._positions, self._moved_at = list(positions), now
         if self._moving is None:
-            self._violate(f"the arm moves without an approval at {now:.3f} s")
+            self._violate(Kind.UNAPPROVED, f"the arm moves without an approval: {'; '.join(self._void) or 'there is none'}", now)
         elif self._stopped_at is not None:
-            self.rest_after_s = now - self._stopped_at
-            if self.rest_after_s > self._limit_s + OVERTAKING_S:
-                self._violate(f"the arm moves {self.rest_after_s:.2f} s after it had to stop, expected at most {self._limit_s:.2f} s")
+            after_s = now - self._stopped_at
+            late = after_s > self._limit_s + OVERTAKING_S
+            if late and self._void:
+                self._violate(Kind.UNAPPROVED, f"the arm moves {after_s:.2f} s after it had to stop: {'; '.join(self._void)}", now)
+            elif late and rested:
+                self._violate(Kind.AFTER_STOP, f"the arm rests and begins to move again {after_s:.2f} s after it had to stop", now)
+            elif late:
+                text = f"the arm still moves {after_s:.2f} s after it had to stop, expected at most {self._limit_s:.2f} s"
+                self._violate(Kind.AFTER_STOP, text, now)
+            if not rested:
+                self.rest_after_s = after_s
 
-    def _violate(self, what: str) -> None:
-        self.violations.append(what)
+    def _violate(self, kind: Kind, text: str, now: float) -> None:
+        self.violations.append(Violation(kind, text, now))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 from campaign import campaign
-from fault_monitor import Monitor
+from fault_monitor import Kind, Monitor
 from processes import BINARIES
 
 # Each takes some 12 s on two cores, the kill of an executor more; `cargo xtask campaign` takes any number.
@@ -34,7 +34,8 @@ def test_the_monitor_catches_a_motion_that_the_deciding_operator_has_not_approve
     if proposal_id is not None:
         monitor.on_approval(proposal_id, operator)
     move(monitor, 1.0)
-    assert monitor.violations == ["the arm moves without an approval at 1.000 s"]
+    assert [found.kind for found in monitor.violations] == [Kind.UNAPPROVED]
+    assert "without an approval" in str(monitor.violations[0])
 
 
 def test_the_monitor_catches_a_motion_that_goes_on_after_a_stop(monitor: Monitor) -> None:
@@ -44,7 +45,8 @@ def test_the_monitor_catches_a_motion_that_goes_on_after_a_stop(monitor: Monitor
     move(monitor, 1.4)
     assert not monitor.violations
     move(monitor, 1.6)
-    assert "0.50 s after it had to stop" in monitor.violations[0]
+    assert [found.kind for found in monitor.violations] == [Kind.AFTER_STOP]
+    assert "0.50 s after it had to stop" in str(monitor.violations[0])
 
 
 def test_the_monitor_catches_a_second_motion_on_the_same_approval(monitor: Monitor) -> None:
@@ -53,7 +55,39 @@ def test_the_monitor_catches_a_second_motion_on_the_same_approval(monitor: Monit
     monitor.on_end(2, 1.1)
     monitor.on_approval(2, "anna")
     move(monitor, 1.3)
-    assert monitor.violations
+    assert [found.kind for found in monitor.violations] == [Kind.UNAPPROVED]
+    assert "the approval of proposal 2 was used before" in str(monitor.violations[0])
+
+
+def test_the_monitor_catches_a_motion_that_begins_again_by_itself(monitor: Monitor) -> None:
+    monitor.on_approval(2, "anna")
+    move(monitor, 1.0)
+    monitor.on_stop(1.1, 0.3)
+    move(monitor, 1.2)
+    move(monitor, 3.0)
+    assert [found.kind for found in monitor.violations] == [Kind.AFTER_STOP]
+    assert "begins to move again 1.90 s after" in str(monitor.violations[0])
+
+
+def test_the_monitor_catches_a_slow_motion(monitor: Monitor) -> None:
+    for step in range(100):
+        monitor.on_joints([1e-4 * step, 0.0], 1.0 + 0.01 * step)
+    assert {found.kind for found in monitor.violations} == {Kind.UNAPPROVED}
+
+
+def test_the_monitor_catches_a_goal_that_takes_the_place_of_one_under_way(monitor: Monitor) -> None:
+    accepted, executing, succeeded, aborted = 1, 2, 4, 6
+    monitor.on_goals({b"a": executing}, 1.0)
+    monitor.on_goals({b"a": succeeded}, 2.0)
+    monitor.on_goals({b"a": succeeded, b"b": executing}, 3.0)
+    monitor.on_goals({b"a": succeeded, b"b": aborted}, 4.0)
+    monitor.on_goals({b"b": aborted, b"c": accepted}, 5.0)
+    assert not monitor.violations
+    monitor.on_goals({b"b": aborted, b"c": aborted, b"d": executing}, 6.0)
+    monitor.on_goals({b"d": executing, b"e": executing}, 7.0)
+    # The first was never heard of while it was under way.
+    monitor.on_goals({b"f": aborted, b"g": executing}, 8.0)
+    assert [(found.kind, found.at_s) for found in monitor.violations] == [(Kind.TWO_GOALS, at_s) for at_s in (6.0, 7.0, 8.0)]
 
 
 def test_the_monitor_catches_a_part_that_a_stop_drops(monitor: Monitor) -> None:
@@ -66,7 +100,8 @@ def test_the_monitor_catches_a_part_that_a_stop_drops(monitor: Monitor) -> None:
     monitor.on_suction(True, 1.4)
     assert not monitor.violations
     monitor.on_suction(False, 1.8)
-    assert "suction is switched off 0.50 s after a stop" in monitor.violations[0]
+    assert [found.kind for found in monitor.violations] == [Kind.DROPPED]
+    assert "suction is switched off 0.50 s after a stop" in str(monitor.violations[0])
 
 
 def test_the_monitor_catches_a_way_home_that_nobody_has_approved(monitor: Monitor) -> None:
@@ -74,7 +109,7 @@ def test_the_monitor_catches_a_way_home_that_nobody_has_approved(monitor: Monito
     monitor.on_plan(70)
     monitor.on_approval(71, "anna")
     move(monitor, 1.0)
-    assert "without an approval" in monitor.violations[0]
+    assert "without an approval" in str(monitor.violations[0])
     monitor.violations.clear()
     monitor.on_approval(70, "anna")
     move(monitor, 2.0)

@@ -3,14 +3,51 @@
 use crate::command::{cargo, run};
 use crate::{python, stage};
 use anyhow::Result;
+use std::path::PathBuf;
+
+/// What the campaign is asked for.
+#[derive(clap::Args)]
+pub struct Options {
+    /// How many faults; each takes some 8 s
+    #[arg(long, default_value_t = 20)]
+    faults: u32,
+    /// The same seed draws the same faults at the same moments
+    #[arg(long, default_value_t = 1)]
+    seed: u64,
+    /// Append a line of JSON for each fault; faults that are in the file are not injected again
+    #[arg(long)]
+    log: Option<PathBuf>,
+    /// End after so long; with --log the next call goes on
+    #[arg(long)]
+    minutes: Option<f64>,
+    /// Run executors with a planted fault each instead: the monitor has to catch all of them
+    #[arg(long)]
+    planted: bool,
+    /// Print the result as one line of JSON
+    #[arg(long)]
+    json: bool,
+}
 
 /// Sets up, builds, and injects faults at random moments of motions; or runs executors with planted faults.
-pub fn run_faults(faults: u32, seed: u64, planted: bool, json: bool) -> Result<()> {
+pub fn run_faults(options: &Options) -> Result<()> {
+    let Options {
+        faults,
+        seed,
+        planted,
+        json,
+        ..
+    } = *options;
     let environment = python::Environment::set_up()?;
     stage::build_programs()?;
     let mut python = environment.python()?;
     python.arg("tests/campaign.py");
     python.args(["--faults", &faults.to_string(), "--seed", &seed.to_string()]);
+    if let Some(log) = &options.log {
+        python.arg("--log").arg(log);
+    }
+    if let Some(minutes) = options.minutes {
+        python.args(["--minutes", &minutes.to_string()]);
+    }
     if planted {
         build_planted()?;
         python.arg("--planted");

@@ -57,20 +57,7 @@ enum Task {
         seed: u64,
     },
     /// Inject faults at random moments of motions, while an independent monitor reads the joints and the approvals
-    Campaign {
-        /// How many faults; each takes some 8 s
-        #[arg(long, default_value_t = 20)]
-        faults: u32,
-        /// The same seed draws the same faults at the same moments
-        #[arg(long, default_value_t = 1)]
-        seed: u64,
-        /// Run executors with a planted fault each instead: the monitor has to catch all of them
-        #[arg(long)]
-        planted: bool,
-        /// Print the result as one line of JSON
-        #[arg(long)]
-        json: bool,
-    },
+    Campaign(campaign::Options),
     /// Check that every dependency has a permissive licence
     Licences,
 }
@@ -87,12 +74,7 @@ fn main() -> Result<()> {
         Task::Check { packages } => check::run_checks(&packages),
         Task::Test { only, pytest } => stage::run_all(&only, &pytest),
         Task::Demo { problem, seed } => demo::run_problem(&problem, seed),
-        Task::Campaign {
-            faults,
-            seed,
-            planted,
-            json,
-        } => campaign::run_faults(faults, seed, planted, json),
+        Task::Campaign(options) => campaign::run_faults(&options),
         Task::Licences => licences::check(),
     }
 }

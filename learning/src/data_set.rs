@@ -20,6 +20,8 @@ pub struct DataSet {
     images: ImageStore,
     /// Demonstrations of the same problem and scene, by their indices.
     scenes: BTreeMap<(String, u64), Vec<usize>>,
+    /// For each demonstration how often it and all before it are drawn; empty where all are drawn alike.
+    draws: Vec<f64>,
 }
 
 impl Default for DataSet {
@@ -197,7 +199,27 @@ impl DataSet {
             demonstrations: Vec::new(),
             images: ImageStore::new(memory, folder),
             scenes: BTreeMap::new(),
+            draws: Vec::new(),
         }
+    }
+
+    /// From now on the demonstrations that it holds are drawn so many times as often as one of a problem that is not named;
+    /// `generated` names those of [`GENERATED`] problems. Numbers above 0.
+    pub fn weigh(&mut self, times: &BTreeMap<String, f64>) {
+        self.draws.clear();
+        if times.is_empty() {
+            return;
+        }
+        let mut sum = 0.0;
+        let draws = self.demonstrations.iter().map(|indexed| {
+            let name = match &*indexed.scene.0 {
+                name if name.starts_with(GENERATED) => "generated",
+                name => name,
+            };
+            sum += times.get(name).copied().unwrap_or(1.0);
+            sum
+        });
+        self.draws = draws.collect();
     }
 
     /// Adds the demonstrations of the first `count` scenes of a problem, in order of their seeds, from a folder that
@@ -363,7 +385,14 @@ impl DataSet {
     fn draw_demonstration<R: Rng>(&self, rng: &mut R) -> Result<usize, DataSetError> {
         match self.demonstrations.is_empty() {
             true => Err(SamplingError::Empty.into()),
-            false => Ok(rng.random_range(0..self.demonstrations.len())),
+            false => Ok(match self.draws.last() {
+                None => rng.random_range(0..self.demonstrations.len()),
+                Some(sum) => {
+                    let drawn = rng.random::<f64>() * sum;
+                    let number = self.draws.partition_point(|until| *until <= drawn);
+                    number.min(self.draws.len() - 1)
+                }
+            }),
         }
     }
 
@@ -619,6 +648,33 @@ mod tests {
         assert!((900..1100).contains(&done), "{done}");
         let share = own as f64 / of_three as f64;
         assert!((0.2..0.3).contains(&share), "{share}");
+    }
+
+    #[test]
+    fn a_problem_of_weight_three_is_drawn_three_times_as_often() {
+        let mut data = DataSet::default();
+        for (problem, first) in [
+            ("placing", 0.0),
+            ("arranged_000004", 100.0),
+            ("routing", 200.0),
+        ] {
+            let mut made = demonstration(&[0.5]);
+            made.problem = problem.into();
+            made.steps[0].observation.height_m.fill(first);
+            data.push(made).unwrap();
+        }
+        let draws = [("placing", 3.0), ("generated", 0.5)];
+        data.weigh(&draws.map(|(name, times)| (name.to_owned(), times)).into());
+        let rules = rules(GoalConditioning::NextStep, 0.0);
+        let mut rng = ChaCha8Rng::seed_from_u64(0);
+        let mut counts = [0; 3];
+        for _ in 0..4500 {
+            let drawn = data.draw(&rules, &mut rng).unwrap();
+            counts[drawn.sample().observation.height_m[0] as usize / 100] += 1;
+        }
+        for (count, expected) in counts.into_iter().zip([3000, 500, 1000_i32]) {
+            assert!((expected - count).abs() < 120, "{counts:?}");
+        }
     }
 
     #[test]

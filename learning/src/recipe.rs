@@ -29,6 +29,10 @@ pub struct Recipe {
     /// Which step is drawn how often.
     #[serde(default)]
     pub sampling: Sampling,
+    /// How often a demonstration is drawn, by the name of its problem, `generated` for those that `sctn problems` drew: so many times
+    /// as often as one of a problem that is not named.
+    #[serde(default, skip_serializing_if = "BTreeMap::is_empty")]
+    pub draws: BTreeMap<String, f64>,
     /// Probability that a sample's next-step goal is the one after the next, against calling a step done too
     /// early.
     #[serde(default)]
@@ -259,6 +263,18 @@ impl Recipe {
                 )?;
             }
         }
+        for (problem, times) in &self.draws {
+            let known = problems.contains(problem) || problem == "generated";
+            let good = known && times.is_finite() && *times > 0.0;
+            let expected = "a number above 0, for one of the field problems or generated";
+            check_field(
+                path,
+                &format!("draws of {problem}"),
+                good,
+                times.to_string(),
+                expected,
+            )?;
+        }
         for (name, share) in [
             ("shown.same_start", shown.same_start),
             ("shown.done", shown.done),
@@ -395,6 +411,13 @@ mod tests {
             changed("demonstrations: 100", "demonstrations: 0")
                 .contains("demonstrations of placing is 0")
         );
+        for (draws, value) in [("{placing: 0}", "0"), ("{stacking: 2}", "2")] {
+            let error = changed("snapshots: 4", &format!("snapshots: 4\ndraws: {draws}"));
+            assert!(
+                error.contains(&format!("is {value}, expected a number above 0")),
+                "{error}"
+            );
+        }
         let error = changed("demonstrations: 100", "demonstrations: {stacking: 3}");
         assert!(error.contains("demonstrations of placing is missing"));
         let both = "demonstrations: {placing: 3, stacking: 3}";

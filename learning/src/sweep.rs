@@ -6,6 +6,7 @@ use crate::images::ImageMemory;
 use crate::recipe::{Demonstrations, Recipe, RecipeError, Validation, check_field, read_yaml};
 use gctn::{NetworkConfig, TrainingConfig};
 use serde::{Deserialize, Serialize};
+use std::collections::BTreeMap;
 use std::path::Path;
 
 /// What to train and to test: every problem with every agent, number of demonstrations and seed.
@@ -224,6 +225,7 @@ impl Sweep {
                 ..self.training.clone()
             },
             sampling: run.agent.sampling(),
+            draws: BTreeMap::new(),
             goal_jitter: self.goal_jitter,
             shown: Shown::default(),
             decoded_mb: ImageMemory::default().decoded_mb,

@@ -138,7 +138,7 @@ impl Training {
     /// Begins a training, or goes on with the one that the folder holds.
     pub fn open(
         recipe: Recipe,
-        data: DataSet,
+        mut data: DataSet,
         directory: &Path,
         resume: bool,
     ) -> Result<Self, TrainingError> {
@@ -156,6 +156,7 @@ impl Training {
                 None => trainer,
             }
         };
+        data.weigh(&recipe.draws);
         let snapshots = directory.join("snapshots");
         std::fs::create_dir_all(&snapshots).map_err(|source| TrainingError::Io {
             path: snapshots,
@@ -257,6 +258,7 @@ mod tests {
                 ..TrainingConfig::compact()
             },
             sampling: Sampling::CompStep,
+            draws: [("placing".into(), 2.0)].into(),
             goal_jitter: 0.3,
             shown: Shown::default(),
             decoded_mb: 1,

@@ -20,6 +20,14 @@ const SHIFT_CELLS: i64 = 3;
 /// and it has not sunk.
 const RISEN: f64 = 0.1;
 const RECOLORED: f64 = 0.5;
+/// The cells themselves take at most so much from the logit of a candidate, and of a turn: they decide between those that look alike
+/// otherwise.
+const MOST_TAKEN: f64 = 2.0;
+const MOST_TAKEN_OF_TURNS: f64 = 4.0;
+/// They take nothing from candidates where the best one differs by more than this: what is moved has no shape of its own, or hides.
+const UNLIKE: f64 = 0.1;
+/// Heights count down to this below what is compared, and up to this above it (of 40 mm).
+const DEEPEST: f64 = 0.5;
 /// Every so manyth rotation is tried.
 const TURN_STRIDE: usize = 2;
 
@@ -52,6 +60,8 @@ fn peaks(grid: &Grid, logits: &[f32], count: usize) -> Vec<usize> {
 
 /// The part of the key around a place that windows are looked for in: its first row and column, and its edge length.
 struct Crop {
+    /// The cell of the place.
+    place: usize,
     row: i64,
     col: i64,
     edge: i64,
@@ -65,6 +75,7 @@ impl Crop {
             (cell as i64 - SHIFT_CELLS).clamp(0, len - edge)
         };
         Self {
+            place,
             row: begin(place / grid.cols, grid.rows),
             col: begin(place % grid.cols, grid.cols),
             edge,
@@ -88,7 +99,7 @@ fn correlate(key: &Tensor, windows: &Tensor) -> Tensor {
         .squeeze_dim(0)
 }
 
-/// Windows of one sample's query (1 x C x rows x cols) at points of the grid, each at all these turns: (points turns) x C x k x k.
+/// Windows of one sample's query (1 x C x rows x cols, or one for each point) at points of the grid, each at all these turns: (points turns) x C x k x k.
 fn windows(
     grid: &Grid,
     query: &Tensor,
@@ -103,58 +114,129 @@ fn windows(
     rotated_windows(&query, margin, grid, sampling, points, &turns, rotations).flatten(0, 1)
 }
 
-/// Minus half the mean squared difference between the cells at a pick, at each turn, and those that appeared at the place:
-/// turns x places x places. Of the only sample.
-fn shape_difference(model: &Compared<'_>, crop: &Crop, pick: Point2<f64>) -> Tensor {
-    let (grid, [seen, before, shown]) = (model.grid, &model.fit.cells);
-    let sum = |x: &Tensor| x.sum_dim_intlist([1].as_slice(), true, None::<Kind>);
-    let change = shown - before;
-    let rise = change.narrow(1, 3, 1);
-    let recolored = sum(&change.narrow(1, 0, 3).abs()).gt(RECOLORED);
-    let appeared = rise
-        .gt(RISEN)
-        .logical_or(&recolored.logical_and(&rise.gt(-RISEN)))
-        .to_kind(seen.kind());
-    // With its surroundings, so that it is told from a larger thing.
-    let mask = appeared.max_pool2d([5, 5], [1, 1], [2, 2], [1, 1], false);
-    let query = Tensor::cat(&[seen, &sum(&seen.square()), &mask.ones_like()], 1);
-    let key = Tensor::cat(
-        &[
-            &mask * shown,
-            &mask * -0.5,
-            &mask * sum(&shown.square()) * -0.5,
-            mask.shallow_clone(),
-            -&mask * shown.narrow(1, 3, 1),
-        ],
-        1,
-    );
-    let key = crop.of(&key.constant_pad_nd([grid.margin as i64; 4]));
-    let turns: Vec<usize> = (0..model.rotations).collect();
-    let windows = windows(grid, &query, &[pick], &turns, model.rotations);
-    let squares = correlate(&key.narrow(1, 0, 6), &windows);
-    // What all heights differ by does not count: an object may stand on another one.
-    let heights = Tensor::cat(&[windows.narrow(1, 3, 1), windows.narrow(1, 5, 1)], 1);
-    let heights = correlate(&key.narrow(1, 6, 2), &heights);
-    let mask = key.narrow(1, 6, 1);
-    let area =
-        correlate(&mask, &windows.narrow(0, 0, 1).narrow(1, 5, 1).ones_like()).clamp_min(1.0);
-    squares / &area + (heights / area).square() * 0.5
+/// Colour and height of a sample's observation, of v_{k-1} and of v_k, each 1 x 4 x rows x cols; and where something appeared.
+struct Cells {
+    seen: Tensor,
+    shown: Tensor,
+    appeared: Tensor,
+    /// With two cells around it, so that it is told from a larger thing.
+    around: Tensor,
+}
+
+impl Cells {
+    fn new(model: &Compared<'_>, sample: i64) -> Self {
+        let cells = model.fit.cells.each_ref();
+        let [seen, before, shown] = cells.map(|cells| cells.narrow(0, sample, 1));
+        let change = &shown - before;
+        let rise = change.narrow(1, 3, 1);
+        let recolored = sum(&change.narrow(1, 0, 3).abs()).gt(RECOLORED);
+        let appeared = rise
+            .gt(RISEN)
+            .logical_or(&recolored.logical_and(&rise.gt(-RISEN)))
+            .to_kind(seen.kind());
+        let around = appeared.max_pool2d([5, 5], [1, 1], [2, 2], [1, 1], false);
+        Self {
+            seen,
+            shown,
+            appeared,
+            around,
+        }
+    }
+}
+
+/// Over channels, which stay.
+fn sum(x: &Tensor) -> Tensor {
+    x.sum_dim_intlist([1].as_slice(), true, None::<Kind>)
+}
+
+/// Minus half the squared difference between the cells at each point, at each of these turns, and those of v_k at the place: of colours
+/// where something appeared, and of heights there and around it; a mean over the cells where something appeared. Heights are relative
+/// to the point's and the place's own: an object may stand on another one. (points turns) x places x places.
+fn shape_difference(
+    model: &Compared<'_>,
+    sample: i64,
+    crop: &Crop,
+    points: &[Point2<f64>],
+    turns: &[usize],
+) -> Tensor {
+    let grid = model.grid;
+    let Cells {
+        seen,
+        shown,
+        appeared,
+        around,
+    } = Cells::new(model, sample);
+    let relative = |image: &Tensor, row: usize, col: usize| {
+        let heights = image.narrow(1, 3, 1);
+        let (first_row, first_col) = (row.max(1) - 1, col.max(1) - 1);
+        let last = |at: usize, len: usize| (at + 2).min(len) as i64;
+        let there = heights
+            .slice(2, first_row as i64, last(row, grid.rows), 1)
+            .slice(3, first_col as i64, last(col, grid.cols), 1);
+        (heights - there.max()).clamp(-DEEPEST, DEEPEST)
+    };
+    let color = shown.narrow(1, 0, 3);
+    let height = relative(&shown, crop.place / grid.cols, crop.place % grid.cols);
+    let squares = &appeared * sum(&color.square()) + &around * height.square();
+    let key = [
+        &appeared * color,
+        &appeared * -0.5,
+        &around * height,
+        &around * -0.5,
+        squares * -0.5,
+        appeared,
+    ];
+    let key = crop.of(&Tensor::cat(&key, 1).constant_pad_nd([grid.margin as i64; 4]));
+    let color = seen.narrow(1, 0, 3);
+    let queries: Vec<Tensor> = points
+        .iter()
+        .map(|point| {
+            let nearest = |at: f64, len: usize| at.round().clamp(0.0, (len - 1) as f64) as usize;
+            let height = relative(
+                &seen,
+                nearest(point.y, grid.rows),
+                nearest(point.x, grid.cols),
+            );
+            let (square, one) = (height.square(), height.ones_like());
+            Tensor::cat(&[&color, &sum(&color.square()), &height, &square, &one], 1)
+        })
+        .collect();
+    let query = Tensor::cat(&queries, 0);
+    let windows = windows(grid, &query, points, turns, model.rotations);
+    let edge = grid.window as i64;
+    let all = Tensor::ones([1, 1, edge, edge], (key.kind(), key.device()));
+    let area = correlate(&key.narrow(1, 7, 1), &all).clamp_min(1.0);
+    correlate(&key.narrow(1, 0, 7), &windows) / area
+}
+
+/// What differences of cells take from logits: weighted, and beyond that of what fits best.
+fn taken(differences: &Tensor, weight: f64, at_most: f64) -> Tensor {
+    ((differences - differences.max()) * weight).clamp_min(-at_most)
+}
+
+/// The highest of what is said of each candidate, over turns and places.
+fn best_of_each(said: &Tensor, candidates: &[usize]) -> Tensor {
+    let said = said.view([candidates.len() as i64, -1]);
+    said.amax([1].as_slice(), false)
 }
 
 /// How well what stands at each candidate, turned and shifted as it fits best, fits what stands at the place: logits.
 fn fits(model: &Compared<'_>, sample: i64, candidates: &[usize], place: usize) -> Tensor {
     let Compared { grid, fit, .. } = *model;
-    let turns: Vec<usize> = (0..model.rotations).step_by(TURN_STRIDE).collect();
-    let points: Vec<_> = candidates
-        .iter()
-        .map(|cell| Point2::new((cell % grid.cols) as f64, (cell / grid.cols) as f64))
-        .collect();
+    let (points, turns) = (model.points(candidates), model.some_turns());
     let crop = Crop::new(grid, place);
     let query = fit.query.narrow(0, sample, 1);
     let windows = windows(grid, &query, &points, &turns, model.rotations);
     let logits = correlate(&crop.of(&fit.key.narrow(0, sample, 1)), &windows) * model.scale;
-    let count = candidates.len() as i64;
-    logits.view([count, -1]).amax([1].as_slice(), false)
+    let learned = best_of_each(&logits, candidates);
+    if model.pick_shape_weight == 0.0 {
+        return learned;
+    }
+    let differences = shape_difference(model, sample, &crop, &points, &turns);
+    let differences = best_of_each(&differences, candidates);
+    // A cable has another shape wherever it lies.
+    let is_like = differences.max().gt(-UNLIKE).to_kind(learned.kind());
+    learned + taken(&differences, model.pick_shape_weight, MOST_TAKEN) * is_like
 }
 
 /// What a network says that compares candidates, and how.
@@ -165,19 +247,39 @@ struct Compared<'a> {
     scale: &'a Tensor,
     rotations: usize,
     shape_weight: f64,
+    pick_shape_weight: f64,
 }
 
 impl<'a> Compared<'a> {
     fn new(grid: &'a Grid, features: &'a Features, config: &NetworkConfig) -> Option<Self> {
         let first = features.first.as_ref()?;
+        let [shape_weight, pick_shape_weight] = config.shape_weights();
         Some(Self {
             grid,
             first,
             fit: first.fit.as_ref()?,
             scale: &features.scale,
             rotations: config.rotations,
-            shape_weight: config.shape_weight(),
+            shape_weight,
+            pick_shape_weight,
         })
+    }
+
+    /// Where cells are on the grid.
+    fn points(&self, cells: &[usize]) -> Vec<Point2<f64>> {
+        let cols = self.grid.cols;
+        let point = |cell: &usize| Point2::new((cell % cols) as f64, (cell / cols) as f64);
+        cells.iter().map(point).collect()
+    }
+
+    /// All turns.
+    fn turns(&self) -> Vec<usize> {
+        (0..self.rotations).collect()
+    }
+
+    /// Turns that candidates are compared at.
+    fn some_turns(&self) -> Vec<usize> {
+        (0..self.rotations).step_by(TURN_STRIDE).collect()
     }
 
     /// The cell of the highest place logit of the only sample.
@@ -212,7 +314,7 @@ pub(crate) fn add_fits(
 }
 
 /// Adds to place logits (1 x rotations x rows x cols) how well the cells at the pick, turned and shifted, fit what appeared at the
-/// place; places further off have the worst.
+/// place; places further off have the least.
 pub(crate) fn add_shape(
     grid: &Grid,
     features: &Features,
@@ -224,9 +326,8 @@ pub(crate) fn add_shape(
     let Some(model) = model else { return };
     let pick = pick_px.map(|coordinate_px| grid.index(coordinate_px));
     let crop = Crop::new(grid, model.place());
-    let shape = shape_difference(&model, &crop, pick);
-    let shape = shape * model.shape_weight;
-    let worst = shape.min();
+    let shape = shape_difference(&model, 0, &crop, &[pick], &model.turns());
+    let taken = taken(&shape, model.shape_weight, MOST_TAKEN_OF_TURNS);
     // Places count from the margin's corner. Those beyond the last row or column are none.
     let places = Crop::places(grid, crop.edge);
     let rows = places.min(grid.rows as i64 - crop.row);
@@ -235,11 +336,53 @@ pub(crate) fn add_shape(
         .narrow(2, crop.row, rows)
         .narrow(3, crop.col, cols)
         .g_add_(
-            &(shape - worst)
+            &(taken + MOST_TAKEN_OF_TURNS)
                 .narrow(1, 0, rows)
                 .narrow(2, 0, cols)
                 .unsqueeze(0),
         );
+}
+
+/// What [`add_shape`] adds to the turns of the true picks at the true places: N x rotations, `None` where it adds nothing. Not learned.
+pub(crate) fn turn_shapes(
+    grid: &Grid,
+    features: &Features,
+    config: &NetworkConfig,
+    labels: &[Label],
+) -> Option<Tensor> {
+    let model = Compared::new(grid, features, config).filter(|model| model.shape_weight > 0.0)?;
+    let shapes: Vec<Tensor> = labels
+        .iter()
+        .enumerate()
+        .map(|(sample, label)| {
+            let pick = label.pick_px.map(|coordinate_px| grid.index(coordinate_px));
+            let place = cell_of(grid, label.place_px);
+            let crop = Crop::new(grid, place);
+            let turns = model.turns();
+            let shape = shape_difference(&model, sample as i64, &crop, &[pick], &turns);
+            // The object may have been held a cell beside the point that was labelled.
+            let within = |at: usize, begin: i64| {
+                (at as i64 - begin - 1).clamp(0, Crop::places(grid, crop.edge) - 3)
+            };
+            let (row, col) = (place / grid.cols, place % grid.cols);
+            let around =
+                shape
+                    .narrow(1, within(row, crop.row), 3)
+                    .narrow(2, within(col, crop.col), 3);
+            let around = around.amax([1, 2].as_slice(), false);
+            taken(&around, model.shape_weight, MOST_TAKEN_OF_TURNS)
+        })
+        .collect();
+    Some(Tensor::stack(&shapes, 0))
+}
+
+/// The cell that holds a point of the image; the last edge belongs to the last cell.
+fn cell_of(grid: &Grid, point_px: Point2<f64>) -> usize {
+    let nearest = |coordinate_px: f64, len: usize| {
+        let index = (grid.index(coordinate_px) + 0.5).floor();
+        index.clamp(0.0, (len - 1) as f64) as usize
+    };
+    nearest(point_px.y, grid.rows) * grid.cols + nearest(point_px.x, grid.cols)
 }
 
 /// Mean loss of the choice among candidates: cross entropy of the true pick's, or of the pick itself where none is near it.
@@ -253,13 +396,6 @@ pub(crate) fn candidate_loss(
         return features.nothing();
     };
     let count = config.candidates();
-    let cell_of = |point_px: Point2<f64>| {
-        let nearest = |coordinate_px: f64, len: usize| {
-            let index = (grid.index(coordinate_px) + 0.5).floor();
-            index.clamp(0.0, (len - 1) as f64) as usize
-        };
-        nearest(point_px.y, grid.rows) * grid.cols + nearest(point_px.x, grid.cols)
-    };
     let losses: Vec<Tensor> = labels
         .iter()
         .enumerate()
@@ -267,7 +403,7 @@ pub(crate) fn candidate_loss(
             let sample = sample as i64;
             let pick = features.pick.detach().get(sample).flatten(0, -1);
             let logits = Vec::<f32>::try_from(&pick.to_kind(Kind::Float)).unwrap_or_default();
-            let (right, place) = (cell_of(label.pick_px), cell_of(label.place_px));
+            let (right, place) = (cell_of(grid, label.pick_px), cell_of(grid, label.place_px));
             let mut candidates = peaks(grid, &logits, count);
             let known = candidates
                 .iter()
@@ -351,17 +487,18 @@ mod tests {
         }
     }
 
-    fn config(candidates: usize, shape_weight: f64) -> NetworkConfig {
+    fn config(candidates: usize, [shape_weight, pick_shape_weight]: [f64; 2]) -> NetworkConfig {
         NetworkConfig::new(Network::Matching(Matching {
             candidates,
             shape_weight,
+            pick_shape_weight,
             ..Matching::default()
         }))
     }
 
     fn picked(features: &Features) -> (usize, usize) {
         let mut logits = values(&features.pick, "the pick map").unwrap();
-        add_fits(&GRID, features, &config(6, 0.0), &mut logits).unwrap();
+        add_fits(&GRID, features, &config(6, [0.0; 2]), &mut logits).unwrap();
         let best = (0..logits.len()).max_by(|one, other| logits[*one].total_cmp(&logits[*other]));
         let best = best.unwrap();
         (best / GRID.cols, best % GRID.cols)
@@ -389,6 +526,53 @@ mod tests {
         }
     }
 
+    /// Features that say nothing of three squares of one colour, but for this much at the second one, where the first one was shown.
+    fn looking_alike(said: f64) -> Features {
+        let seen = [(10, 10, 7), (10, 28, 3), (30, 10, 3)];
+        let mut features = features(&seen, (45, 22, 7));
+        features.pick *= 0.1;
+        let mut second = features.pick.get(0).get(10).get(28);
+        let _ = second.g_add_scalar_(said);
+        let fit = features.first.as_mut().and_then(|first| first.fit.as_mut());
+        let fit = fit.unwrap();
+        fit.key = fit.key.zeros_like();
+        features
+    }
+
+    #[test]
+    fn where_features_say_nothing_the_cells_themselves_tell_sizes_apart() {
+        let picked = |said: f64, weight: f64| {
+            let features = looking_alike(said);
+            let mut logits = values(&features.pick, "the pick map").unwrap();
+            add_fits(&GRID, &features, &config(6, [0.0, weight]), &mut logits).unwrap();
+            let best =
+                (0..logits.len()).max_by(|one, other| logits[*one].total_cmp(&logits[*other]));
+            let best = best.unwrap();
+            best / GRID.cols < 20 && best % GRID.cols < 20
+        };
+        assert!(!picked(1.0, 0.0), "the features' say");
+        assert!(picked(1.0, 20.0), "the cells' say");
+        // More than the cells may take.
+        assert!(!picked(2.0 * MOST_TAKEN, 1000.0));
+    }
+
+    #[test]
+    fn the_turn_that_the_cells_say_is_what_the_loss_adds() {
+        let features = turned_oblong();
+        let label = Label {
+            pick_px: Point2::new(GRID.coordinate_px(10.0), GRID.coordinate_px(10.0)),
+            place_px: Point2::new(GRID.coordinate_px(22.0), GRID.coordinate_px(45.0)),
+            rotation: 9,
+            done: false,
+        };
+        let shapes = |weight| turn_shapes(&GRID, &features, &config(4, [weight, 0.0]), &[label]);
+        assert!(shapes(0.0).is_none());
+        let shapes = shapes(20.0).unwrap();
+        assert_eq!(shapes.size(), [1, 36]);
+        let best = shapes.argmax(None, false).int64_value(&[]);
+        assert!(best == 9 || best == 27, "turn {best}");
+    }
+
     #[test]
     fn a_place_in_the_corner_is_compared_too() {
         let seen = [(20, 10, 3), (40, 28, 5)];
@@ -399,8 +583,8 @@ mod tests {
         );
     }
 
-    #[test]
-    fn the_cells_themselves_say_how_an_oblong_was_turned() {
+    /// An oblong that lies at 10, 10 and was shown standing at 45, 22.
+    fn turned_oblong() -> Features {
         let oblong = |rows: std::ops::RangeInclusive<usize>,
                       cols: std::ops::RangeInclusive<usize>| {
             let mut values = vec![0.0_f32; GRID.rows * GRID.cols];
@@ -414,9 +598,15 @@ mod tests {
         let fit = features.first.as_mut().and_then(|first| first.fit.as_mut());
         fit.unwrap().cells = [&lying, &lying.zeros_like(), &standing]
             .map(|image| image.expand([1, 4, -1, -1], false));
+        features
+    }
+
+    #[test]
+    fn the_cells_themselves_say_how_an_oblong_was_turned() {
+        let features = turned_oblong();
         let logits = Tensor::zeros([1, 36, 60, 40], (Kind::Float, tch::Device::Cpu));
         let pick_px = Point2::new(GRID.coordinate_px(10.0), GRID.coordinate_px(10.0));
-        add_shape(&GRID, &features, &config(4, 20.0), pick_px, &logits);
+        add_shape(&GRID, &features, &config(4, [20.0, 0.0]), pick_px, &logits);
         let best = logits.argmax(None, false).int64_value(&[]) as usize;
         let (turn, row, col) = (best / 2400, best / 40 % 60, best % 40);
         assert!(turn == 9 || turn == 27, "turn {turn}");
@@ -436,7 +626,7 @@ mod tests {
         };
         let features = features(&[(10, 10, 3), (10, 28, 7)], (45, 22, 7));
         let loss = |row, col| {
-            let loss = candidate_loss(&GRID, &features, &config(4, 0.0), &[label(row, col)]);
+            let loss = candidate_loss(&GRID, &features, &config(4, [0.0; 2]), &[label(row, col)]);
             loss.double_value(&[])
         };
         // Several candidates are on the large square.

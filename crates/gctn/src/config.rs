@@ -198,10 +198,14 @@ pub struct Matching {
     /// the features decides among them. 0: the pick map alone decides.
     #[serde(skip_serializing_if = "is_zero")]
     pub candidates: usize,
-    /// Weight of what the cells themselves say of turns: the mean squared difference of colour and height, up to a height that all
-    /// cells share, where something appeared in v_k. 0: nothing.
+    /// Weight of what the cells themselves say of turns: the mean squared difference of colours, and of heights relative to the thing
+    /// that is moved, where something appeared in v_k. It counts in training too. 0: nothing.
     #[serde(skip_serializing_if = "is_nothing")]
     pub shape_weight: f64,
+    /// Weight of what the cells themselves say of candidates: the same difference. It takes at most 2 from a logit, and nothing where
+    /// no candidate is like what was moved. 0: nothing.
+    #[serde(skip_serializing_if = "is_nothing")]
+    pub pick_shape_weight: f64,
     /// Edge length of the query window round the pick, in cells of stride 2. Odd.
     pub window_cells: usize,
     /// How the query window is rotated.
@@ -219,6 +223,7 @@ impl Default for Matching {
             context_channels: 4,
             candidates: 0,
             shape_weight: 0.0,
+            pick_shape_weight: 0.0,
             window_cells: 21,
             rotation_sampling: Interpolation::Bilinear,
         }
@@ -373,10 +378,14 @@ impl NetworkConfig {
                 }
                 let good = matching.candidates != 1 && matching.candidates <= 64;
                 check("candidates", good, matching.candidates, "0, or 2 to 64")?;
-                let good = (0.0..=1e3).contains(&matching.shape_weight)
-                    && (matching.shape_weight == 0.0 || matching.candidates > 0);
-                let expected = "0 to 1000, and 0 without candidates";
-                check("shape_weight", good, matching.shape_weight, expected)?;
+                for (what, weight) in [
+                    ("shape_weight", matching.shape_weight),
+                    ("pick_shape_weight", matching.pick_shape_weight),
+                ] {
+                    let good =
+                        (0.0..=1e3).contains(&weight) && (weight == 0.0 || matching.candidates > 0);
+                    check(what, good, weight, "0 to 1000, and 0 without candidates")?;
+                }
                 heads(matching.feature_channels, matching.window_cells)
             }
         }
@@ -390,11 +399,11 @@ impl NetworkConfig {
         }
     }
 
-    /// Weight of the cells themselves in comparing candidates and turns.
-    pub(crate) fn shape_weight(&self) -> f64 {
+    /// Weights of the cells themselves in comparing turns, and in comparing candidates.
+    pub(crate) fn shape_weights(&self) -> [f64; 2] {
         match &self.network {
-            Network::Matching(matching) => matching.shape_weight,
-            Network::Compact(_) | Network::GrConvnet(_) | Network::Resnet43(_) => 0.0,
+            Network::Matching(matching) => [matching.shape_weight, matching.pick_shape_weight],
+            Network::Compact(_) | Network::GrConvnet(_) | Network::Resnet43(_) => [0.0; 2],
         }
     }
 
@@ -405,6 +414,7 @@ impl NetworkConfig {
             if let Network::Matching(matching) = &mut config.network {
                 matching.candidates = 0;
                 matching.shape_weight = 0.0;
+                matching.pick_shape_weight = 0.0;
             }
             config
         };

@@ -7,7 +7,7 @@ use tch::{Kind, Tensor};
 use crate::correlation::{correlate, rotated_windows};
 use crate::input::Label;
 use crate::network::{Features, FirstPlace, Grid};
-use crate::{Interpolation, PlaceLoss};
+use crate::{Interpolation, PlaceLoss, TrainingConfig};
 
 /// Continuous index on the grid of a point of the image.
 fn index(grid: &Grid, point_px: Point2<f64>) -> Point2<f64> {
@@ -148,23 +148,24 @@ pub(crate) fn query_windows(
     )
 }
 
-/// Mean place loss of a batch.
+/// Mean place loss of a batch. `shapes` (N x rotations): what is added to the logits of turns where one wrong turn is drawn.
 pub(crate) fn place_loss(
     grid: &Grid,
-    loss: PlaceLoss,
-    sigma_cells: f64,
+    training: &TrainingConfig,
     rotations: usize,
     features: &Features,
+    shapes: Option<&Tensor>,
     labels: &[Label],
     rng: &mut impl Rng,
 ) -> Tensor {
+    let sigma_cells = training.label_sigma_cells;
     let picks: Vec<_> = labels.iter().map(|label| label.pick_px).collect();
     let places: Vec<_> = labels.iter().map(|label| label.place_px).collect();
     let target = targets(grid, sigma_cells, &places, &features.key);
     let all: Vec<Vec<usize>> = labels.iter().map(|_| (0..rotations).collect()).collect();
     let right: Vec<_> = labels.iter().map(|label| label.rotation as i64).collect();
     let right = Tensor::from_slice(&right).to_device(features.key.device());
-    match loss {
+    match training.place_loss {
         PlaceLoss::AllRotations => {
             let logits = place_logits(grid, features, &picks, &all, rotations);
             let size = [labels.len() as i64, 1, grid.rows as i64, grid.cols as i64];
@@ -184,6 +185,7 @@ pub(crate) fn place_loss(
                 .flatten(2, -1)
                 .matmul(&there.flatten(2, -1).transpose(1, 2));
             let dots = dots.squeeze_dim(2) * &features.scale;
+            let dots = shapes.map_or_else(|| dots.shallow_clone(), |shapes| &dots + shapes);
             let turn_loss =
                 dots.cross_entropy_loss(&right, None::<&Tensor>, tch::Reduction::Mean, -100, 0.0);
             if rotations == 1 {
@@ -309,8 +311,13 @@ mod tests {
                 let mut features = features(&sample);
                 features.scale = Tensor::from_slice(&[10f32]);
                 let mut rng = ChaCha8Rng::seed_from_u64(1);
-                let loss = PlaceLoss::RightAndOneWrong;
-                place_loss(&HALF, loss, 0.7, 36, &features, &[label], &mut rng).double_value(&[])
+                let training = TrainingConfig {
+                    place_loss: PlaceLoss::RightAndOneWrong,
+                    label_sigma_cells: 0.7,
+                    ..TrainingConfig::compact()
+                };
+                let loss = place_loss(&HALF, &training, 36, &features, None, &[label], &mut rng);
+                loss.double_value(&[])
             };
             let right = loss(label);
             for wrong in [1, 18, 35].map(|by| (rotation + by) % 36) {

@@ -5,7 +5,7 @@ use std::path::Path;
 use tch::Tensor;
 
 use crate::batch::{Batch, BatchMaker};
-use crate::candidates::candidate_loss;
+use crate::candidates::{candidate_loss, turn_shapes};
 use crate::checkpoint::{self, File};
 use crate::input::Label;
 use crate::losses::{done_loss, first_place_loss, pick_loss, place_loss};
@@ -195,15 +195,17 @@ impl Trainer {
         let to_do = |index: &usize| !labels[*index].done;
         let to_do: Vec<usize> = (0..labels.len()).filter(to_do).collect();
         let of = |features: &Features, labels: &[Label], rng: &mut ChaCha8Rng| {
-            let (loss, rotations) = (self.config.place_loss, network.rotations);
+            let (training, rotations) = (&self.config, network.rotations);
             let pick = pick_loss(grid, sigma, features, labels);
             let pick = match network.candidates() {
                 0 => pick,
                 _ => pick + candidate_loss(grid, features, network, labels),
             };
+            let shapes = turn_shapes(grid, features, network, labels);
+            let shapes = shapes.as_ref();
             [
                 pick,
-                place_loss(grid, loss, sigma, rotations, features, labels, rng),
+                place_loss(grid, training, rotations, features, shapes, labels, rng),
             ]
         };
         let [pick, place] = if to_do.len() == labels.len() {

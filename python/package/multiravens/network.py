@@ -45,6 +45,7 @@ _DEFAULTS: dict[str, dict[str, Any]] = {
         "context_channels": 4,
         "candidates": 0,
         "shape_weight": 0.0,
+        "pick_shape_weight": 0.0,
         "window_cells": 21,
         "rotation_sampling": "bilinear",
     },
@@ -55,6 +56,9 @@ _COLOR, _HEIGHT_M = (0.18877631, 0.07276466), (0.00509261, 0.00903967)
 # Candidates for the pick are more than so many cells apart; a window is looked for in so many cells around the place; every so
 # manyth rotation is tried.
 _APART_CELLS, _SHIFT_CELLS, _TURN_STRIDE = 4.0, 3, 2
+# The cells themselves take at most so much from the logit of a candidate, and of a turn. They take nothing from candidates where the
+# best one differs by more than this. Heights count down to this below what is compared, and up to this above it (of 40 mm).
+_MOST_TAKEN, _MOST_TAKEN_OF_TURNS, _UNLIKE, _DEEPEST = 2.0, 4.0, 0.1, 0.5
 # What appeared has risen by more than this (of 40 mm), or its colour has changed by more than that (of 128, over three channels).
 _RISEN, _RECOLORED = 0.1, 0.5
 
@@ -304,37 +308,83 @@ class Network(nn.Module):
         row, col = (min(max(a - _SHIFT_CELLS, 0), whole + size // 2 * 2 - edge) for a, whole in zip(at, self.grid, strict=True))
         return row, col, edge
 
-    def _add_shape(self, features: Features, center: Sequence[float], logits: torch.Tensor) -> torch.Tensor:
-        """Place logits with how well the cells at the pick, turned and shifted, fit what appeared at the place."""
-        assert features.place is not None and features.cells is not None
-        network, rotations = self.config["network"], self.config["rotations"]
-        size, (rows, cols) = network["window_cells"], self.grid
-        seen, before, shown = features.cells
+    def _appeared(self, features: Features) -> tuple[torch.Tensor, torch.Tensor]:
+        """Where something appeared in the goal, 1 x rows x cols; and with two cells around it, so that it is told from a larger thing."""
+        assert features.cells is not None
+        _, before, shown = features.cells
         change = shown - before
         recolored = (change[:3].abs().sum(0) > _RECOLORED) & (change[3] > -_RISEN)
-        appeared = ((change[3] > _RISEN) | recolored).to(shown.dtype)
-        # With its surroundings, so that it is told from a larger thing.
-        mask = F.max_pool2d(appeared[None], 5, 1, 2)
-        query = torch.cat([seen, seen.square().sum(0, keepdim=True), torch.ones_like(mask)])
-        key = torch.cat([mask * shown, -mask / 2, -mask * shown.square().sum(0, keepdim=True) / 2, mask, -mask * shown[3:]])
-        top, left, edge = self._crop(features.place)
-        key = F.pad(key, (size // 2,) * 4)[None, :, top : top + edge, left : left + edge]
-        bilinear = network["rotation_sampling"] == "bilinear"
-        turns = (2 * math.pi * turn / rotations for turn in range(rotations))
-        windows = torch.stack([window(query, center, turn, size, bilinear) for turn in turns])
-        area = F.conv2d(key[:, 6:7], torch.ones(1, 1, size, size)).clamp_min(1.0)[0]
-        # What all heights differ by does not count: an object may stand on another one.
-        heights = F.conv2d(key[:, 6:8], windows[:, [3, 5]])[0] / area
-        shape = network["shape_weight"] * (F.conv2d(key[:, :6], windows)[0] / area + heights.square() / 2)
-        added = torch.full_like(logits, float(shape.min()))
+        appeared = ((change[3] > _RISEN) | recolored).to(shown.dtype)[None]
+        return appeared, F.max_pool2d(appeared, 5, 1, 2)
+
+    def _cropped(self, key: torch.Tensor, crop: tuple[int, int, int]) -> torch.Tensor:
+        """What windows are compared with of a key without its margin."""
+        top, left, edge = crop
+        margin = self.config["network"]["window_cells"] // 2
+        return F.pad(key, (margin,) * 4)[None, :, top : top + edge, left : left + edge]
+
+    def _windows(self, query: torch.Tensor, center: Sequence[float], stride: int) -> torch.Tensor:
+        """Windows at every so manyth turn: turns x channels x size x size."""
+        network, rotations = self.config["network"], self.config["rotations"]
+        bilinear, size = network["rotation_sampling"] == "bilinear", network["window_cells"]
+        turns = (2 * math.pi * turn / rotations for turn in range(0, rotations, stride))
+        return torch.stack([window(query, center, turn, size, bilinear) for turn in turns])
+
+    def _shape_difference(self, features: Features, centers: Sequence[Sequence[float]], stride: int) -> torch.Tensor:
+        """Minus half the squared difference between the cells at each point, at every so manyth turn, and those of the goal at the
+        place: of colours where something appeared, and of heights there and around it; a mean over the cells where something appeared.
+        Heights are relative to the point's and the place's own: an object may stand on another one. Points x turns x places x places.
+        """
+        assert features.place is not None and features.cells is not None
+        rows, cols = self.grid
+        seen, _, shown = features.cells
+        appeared, around = self._appeared(features)
+
+        def relative(image: torch.Tensor, row: int, col: int) -> torch.Tensor:
+            there = image[3, max(row - 1, 0) : row + 2, max(col - 1, 0) : col + 2].max()
+            return (image[3:] - there).clamp(-_DEEPEST, _DEEPEST)
+
+        color, height = shown[:3], relative(shown, *divmod(int(features.place.argmax()), cols))
+        squares = appeared * color.square().sum(0, keepdim=True) + around * height.square()
+        key = torch.cat([appeared * color, -appeared / 2, around * height, -around / 2, -squares / 2, appeared])
+        key = self._cropped(key, self._crop(features.place))
+        size = self.config["network"]["window_cells"]
+        area = F.conv2d(key[:, 7:8], torch.ones(1, 1, size, size)).clamp_min(1.0)[0]
+        color = seen[:3]
+        found = []
+        for center in centers:
+            col, row = (min(max(math.floor(at + 0.5), 0), end - 1) for at, end in zip(center, (cols, rows), strict=True))
+            height = relative(seen, row, col)
+            query = torch.cat([color, color.square().sum(0, keepdim=True), height, height.square(), torch.ones_like(height)])
+            found.append(F.conv2d(key[:, :7], self._windows(query, center, stride))[0] / area)
+        return torch.stack(found)
+
+    def _add_shape(self, features: Features, center: Sequence[float], logits: torch.Tensor) -> torch.Tensor:
+        """Place logits with how well the cells at the pick, turned and shifted, fit what appeared at the place."""
+        assert features.place is not None
+        rows, cols = self.grid
+        shape = self._shape_difference(features, [center], 1)[0]
+        shape = (self.config["network"]["shape_weight"] * (shape - shape.max())).clamp_min(-_MOST_TAKEN_OF_TURNS)
+        added = torch.full_like(logits, -_MOST_TAKEN_OF_TURNS)
+        top, left, _ = self._crop(features.place)
         high, wide = min(shape.shape[1], rows - top), min(shape.shape[2], cols - left)
         added[:, top : top + high, left : left + wide] = shape[:, :high, :wide]
         return logits + added
 
+    def _taken(self, features: Features, peaks: Sequence[tuple[int, int]]) -> torch.Tensor:
+        """What the cells themselves take from the logit of each candidate: their weighted difference beyond that of the candidate that
+        fits best."""
+        differences = self._shape_difference(features, [[col, row] for row, col in peaks], _TURN_STRIDE).amax((1, 2, 3))
+        # A cable has another shape wherever it lies.
+        if differences.max() <= -_UNLIKE:
+            return torch.zeros_like(differences)
+        taken = self.config["network"]["pick_shape_weight"] * (differences - differences.max())
+        return taken.clamp_min(-_MOST_TAKEN)
+
     def add_fits(self, features: Features, picks: Any) -> Any:
         """Logits of picks (rows x cols, numpy) with how well their highest peaks fit what is to be placed: cells around a peak
         share its fit, all others have the worst."""
-        network, rotations = self.config["network"], self.config["rotations"]
+        network = self.config["network"]
         rows, cols = self.grid
         peaks: list[tuple[int, int]] = []
         for cell in np.argsort(-picks, axis=None, kind="stable"):
@@ -346,14 +396,14 @@ class Network(nn.Module):
         if not peaks or features.place is None or features.fit is None:
             return picks
         query, key = features.fit
-        bilinear, size = network["rotation_sampling"] == "bilinear", network["window_cells"]
         top, left, edge = self._crop(features.place)
         key = key[None, :, top : top + edge, left : left + edge]
-        turns = [2 * math.pi * turn / rotations for turn in range(0, rotations, _TURN_STRIDE)]
         fits = []
         for row, col in peaks:
-            windows = torch.stack([window(query, [col, row], turn, size, bilinear) for turn in turns])
+            windows = self._windows(query, [col, row], _TURN_STRIDE)
             fits.append(float((features.scale * F.conv2d(key, windows)).max()))
+        if network.get("pick_shape_weight", 0.0) > 0:
+            fits = [fit + float(each) for fit, each in zip(fits, self._taken(features, peaks), strict=True)]
         y, x = np.mgrid[:rows, :cols]
         added = np.full_like(picks, min(fits))
         for (row, col), fit in reversed(list(zip(peaks, fits, strict=True))):

@@ -16,7 +16,9 @@ use crate::augment::Warp;
 use crate::input::{Label, encode, tensor};
 use crate::losses::{done_loss, first_place_loss, pick_loss, place_logits, place_loss};
 use crate::{Compact, ModelCard, Network, NetworkConfig, PlaceLoss, Precision, Resnet43, Storage};
-use crate::{Goal, GoalConditioning, GrConvnet, Interpolation, Matching, checkpoint};
+use crate::{
+    Goal, GoalConditioning, GrConvnet, Interpolation, Matching, TrainingConfig, checkpoint,
+};
 
 /// Who checks.
 #[derive(Clone, Copy, Debug)]
@@ -131,14 +133,19 @@ fn check(
             config.rotations,
         )
     });
+    let training = TrainingConfig {
+        place_loss: loss,
+        label_sigma_cells: sigma_cells,
+        ..TrainingConfig::compact()
+    };
     let mut losses = vec![
         pick_loss(&model.grid, sigma_cells, &features, &[label]),
         place_loss(
             &model.grid,
-            loss,
-            sigma_cells,
+            &training,
             config.rotations,
             &features,
+            None,
             &[label],
             &mut ChaCha8Rng::seed_from_u64(7),
         ),

@@ -40,8 +40,8 @@ def start_for_module(request: pytest.FixtureRequest, domain: int, tmp_path_facto
 def _starter(request: pytest.FixtureRequest, domain: int, log_directory: pathlib.Path) -> Iterator[Start]:
     processes: list[Process] = []
 
-    def start(name: str, *arguments: object, domain: int = domain) -> Process:
-        process = Process(name, [str(argument) for argument in arguments], domain, log_directory)
+    def start(name: str, *arguments: object, domain: int = domain, typed: bool = False) -> Process:
+        process = Process(name, [str(argument) for argument in arguments], domain, log_directory, typed=typed)
         processes.append(process)
         return process
 

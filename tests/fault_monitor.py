@@ -15,6 +15,8 @@ REST_TIME_S = 0.2
 # Status of a goal in action_msgs/GoalStatus: accepted, executing and cancelling ones move the arm.
 UNDER_WAY = (1, 2, 3)
 CANCELED, ABORTED = 5, 6
+# A goal that the driver accepts after the stop can be cancelled only then: the arm may move for so long.
+LATE_GOAL_S = 0.3
 
 
 class Kind(enum.Enum):
@@ -64,8 +66,12 @@ class Monitor:
     _positions: list[float] | None = None
     _moved_at: float = 0.0
     _suction: bool = False
-    # Status of each goal of the driver's action.
-    _goals: dict[bytes, int] = dataclasses.field(default_factory=dict)
+    # Proposals whose approval must not move the arm, and why.
+    _voided: dict[int, str] = dataclasses.field(default_factory=dict)
+    # Status of each goal of each action of the driver.
+    _goals: dict[str, dict[bytes, int]] = dataclasses.field(default_factory=dict)
+    # When a goal was accepted after the stop.
+    _late_goal_at: float | None = None
 
     def on_proposal(self, proposal_id: int) -> None:
         """The newest proposal replaces the one before, but not the one that is being carried out."""
@@ -78,12 +84,18 @@ class Monitor:
         if proposal_id != self._newest and proposal_id not in self._used:
             self._home = proposal_id
 
+    def on_void(self, proposal_id: int, reason: str) -> None:
+        """A proposal must not move the arm even where it is approved."""
+        self._voided[proposal_id] = reason
+
     def on_approval(self, proposal_id: int, operator: str) -> None:
         """Only the deciding operator's first approval of the newest proposal lets the arm move."""
         if operator != self.deciding_operator:
             self._void.append(f"the approval of proposal {proposal_id} came from {operator}, who does not decide")
         elif proposal_id in self._used:
             self._void.append(f"the approval of proposal {proposal_id} was used before")
+        elif proposal_id in self._voided:
+            self._void.append(f"the approval of proposal {proposal_id} must not count: {self._voided[proposal_id]}")
         elif proposal_id not in (self._newest, self._home):
             self._void.append(f"the approval was of proposal {proposal_id}, which is not the one that is offered")
         else:
@@ -97,6 +109,7 @@ class Monitor:
         if self._stopped_at is None:
             self._stopped_at, self._limit_s, self.rest_after_s = now, limit_s, 0.0
             self._void = []
+            self._late_goal_at = None
 
     def on_end(self, proposal_id: int, now: float) -> None:
         """The executor says that a motion has ended: nothing moves any more."""
@@ -110,19 +123,29 @@ class Monitor:
             text = f"suction is switched off {now - self._stopped_at:.2f} s after a stop: what is held is dropped"
             self._violate(Kind.DROPPED, text, now)
 
-    def on_goals(self, statuses: Mapping[bytes, int], now: float) -> None:
-        """The statuses of an action's goals: no goal comes while another is under way."""
-        before, self._goals = self._goals, dict(statuses)
+    def on_goals(self, action: str, statuses: Mapping[bytes, int], now: float, answers_late: bool = False) -> None:
+        """The statuses of an action's goals: no goal comes while another is under way.
+
+        Where the driver takes its time to answer, a goal from before a stop may be accepted after it.
+        """
+        before = self._goals.get(action, {})
+        self._goals[action] = dict(statuses)
         new = [goal for goal, status in statuses.items() if goal not in before and status in UNDER_WAY]
         replaced = [goal for goal, status in statuses.items() if status in (CANCELED, ABORTED) and before.get(goal, 1) in UNDER_WAY]
         under_way = [goal for goal, status in statuses.items() if status in UNDER_WAY]
         if new and (replaced or len(under_way) > 1):
             self._violate(Kind.TWO_GOALS, "a goal takes the place of one under way: two executors act on one approval", now)
+        if new and answers_late and self._stopped_at is not None and self._late_goal_at is None:
+            self._late_goal_at = now
+
+    def on_lost_sight(self) -> None:
+        """The driver says nothing any more: where the arm has come to rest meanwhile is not known before the next reading."""
+        self._positions = None
 
     def on_joints(self, positions: list[float], now: float) -> None:
         """A reading of the joints."""
         if self._positions is None:
-            self._positions, self._moved_at = list(positions), now
+            self._positions = list(positions)
             return
         if max(abs(a - b) for a, b in zip(positions, self._positions, strict=True)) <= MOVING_RAD:
             return
@@ -132,7 +155,8 @@ class Monitor:
             self._violate(Kind.UNAPPROVED, f"the arm moves without an approval: {'; '.join(self._void) or 'there is none'}", now)
         elif self._stopped_at is not None:
             after_s = now - self._stopped_at
-            late = after_s > self._limit_s + OVERTAKING_S
+            accepted_late = self._late_goal_at is not None and now - self._late_goal_at <= LATE_GOAL_S + OVERTAKING_S
+            late = after_s > self._limit_s + OVERTAKING_S and not accepted_late
             if late and self._void:
                 self._violate(Kind.UNAPPROVED, f"the arm moves {after_s:.2f} s after it had to stop: {'; '.join(self._void)}", now)
             elif late and rested:

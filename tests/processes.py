@@ -75,8 +75,16 @@ class Process:
     """One running executable, its output in files."""
 
     def __init__(
-        self, name: str, arguments: list[str], domain: int, log_directory: pathlib.Path, variables: dict[str, str] | None = None
+        self,
+        name: str,
+        arguments: list[str],
+        domain: int,
+        log_directory: pathlib.Path,
+        variables: dict[str, str] | None = None,
+        prefix: list[str] | None = None,
+        typed: bool = False,
     ) -> None:
+        """With a prefix the executable is started by another program, which has to become it. Typed: it reads what `type` is given."""
         self.name = name
         executable = BINARIES / name
         if not executable.exists():
@@ -87,10 +95,10 @@ class Process:
         with self._output_file.open("wb") as output, self._error_file.open("wb") as errors:
             # Its own session: whatever it starts can be found and ended with it.
             self._child = subprocess.Popen(
-                [executable, *map(str, arguments)],
+                [*(prefix or []), executable, *map(str, arguments)],
                 cwd=REPOSITORY,
                 env={**environment(domain), **(variables or {})},
-                stdin=subprocess.DEVNULL,
+                stdin=subprocess.PIPE if typed else subprocess.DEVNULL,
                 stdout=output,
                 stderr=errors,
                 start_new_session=True,
@@ -107,6 +115,15 @@ class Process:
     def signal(self, number: int) -> None:
         """Sends it a signal."""
         self._child.send_signal(number)
+
+    def type(self, line: str) -> None:
+        """Types a line at its terminal."""
+        self._child.stdin.write(f"{line}\n".encode())
+        self._child.stdin.flush()
+
+    def close_terminal(self) -> None:
+        """Closes its standard input."""
+        self._child.stdin.close()
 
     def output(self) -> str:
         """Standard output so far."""

@@ -36,6 +36,7 @@ class Cell:
         self._heightmaps = operator.node.create_publisher(Heightmap, "heightmap", LATCHED)
         self._proposals = operator.node.create_publisher(PickPlace, "pick_place", LATCHED)
         self._id = 0
+        self.newest_heightmap: Heightmap | None = None
 
     def wait_until_ready(self) -> None:
         """Everybody knows everybody, and the arm has reported where it stands."""
@@ -67,8 +68,13 @@ class Cell:
             coverage=1.0,
         )
         change(heightmap)
-        self._publish(self._heightmaps, heightmap)
+        self.repeat_heightmap(heightmap)
         return heightmap
+
+    def repeat_heightmap(self, heightmap: Heightmap) -> None:
+        """Publishes a heightmap, maybe once more."""
+        self.newest_heightmap = heightmap
+        self._publish(self._heightmaps, heightmap)
 
     def propose(self, heightmap: Heightmap, change: Callable[[PickPlace], None] = lambda _: None) -> PickPlace:
         """Publishes a proposal that is good unless changed."""

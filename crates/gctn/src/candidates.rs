@@ -3,10 +3,10 @@
 //! The pick map compares single vectors, which see some centimetres: blocks that differ in their size only look alike to it. A
 //! window sees the whole object.
 
-use nalgebra::Point2;
+use nalgebra::{Point2, Vector2};
 use tch::{Kind, Tensor};
 
-use crate::correlation::rotated_windows;
+use crate::correlation::{rotated_windows, sampled_windows};
 use crate::input::Label;
 use crate::network::{Features, FirstPlace, Fit, Grid};
 use crate::policy::values;
@@ -24,6 +24,10 @@ const RECOLORED: f64 = 0.5;
 /// otherwise.
 const MOST_TAKEN: f64 = 2.0;
 const MOST_TAKEN_OF_TURNS: f64 = 4.0;
+/// The same of turns by fine cells, which take nothing where the best turn differs by more than this: cables by 0.23 to 0.55, things
+/// that keep their shape by at most 0.17.
+const MOST_TAKEN_OF_FINE_TURNS: f64 = 8.0;
+const UNLIKE_FINE: f64 = 0.2;
 /// They take nothing from candidates where the best one differs by more than this: what is moved has no shape of its own, or hides.
 const UNLIKE: f64 = 0.1;
 /// Heights count down to this below what is compared, and up to this above it (of 40 mm).
@@ -84,8 +88,16 @@ impl Crop {
 
     /// Of a key with its margin.
     fn of(&self, key: &Tensor) -> Tensor {
-        key.narrow(2, self.row, self.edge)
-            .narrow(3, self.col, self.edge)
+        self.scaled(key, 1)
+    }
+
+    /// Of a key with its margin, whose cells are so many times smaller.
+    fn scaled(&self, key: &Tensor, factor: i64) -> Tensor {
+        key.narrow(2, factor * self.row, factor * self.edge).narrow(
+            3,
+            factor * self.col,
+            factor * self.edge,
+        )
     }
 
     /// Cells that windows are compared at, along each edge.
@@ -95,11 +107,34 @@ impl Crop {
 }
 
 fn correlate(key: &Tensor, windows: &Tensor) -> Tensor {
-    key.conv2d(windows, None::<&Tensor>, [1, 1], [0, 0], [1, 1], 1)
+    strided(key, windows, 1)
+}
+
+fn strided(key: &Tensor, windows: &Tensor, stride: i64) -> Tensor {
+    key.conv2d(windows, None::<&Tensor>, [stride; 2], [0, 0], [1, 1], 1)
         .squeeze_dim(0)
 }
 
-/// Windows of one sample's query (1 x C x rows x cols, or one for each point) at points of the grid, each at all these turns: (points turns) x C x k x k.
+/// By which cells shapes are compared.
+#[derive(Clone, Copy, PartialEq)]
+enum Fineness {
+    /// Those of the grid.
+    Grid,
+    /// Those of the heightmap, two for each of the grid along rows and columns.
+    Heightmap,
+}
+
+impl Fineness {
+    fn factor(self) -> i64 {
+        match self {
+            Self::Grid => 1,
+            Self::Heightmap => 2,
+        }
+    }
+}
+
+/// Windows of one sample's query (1 x C x rows x cols, or one for each point) at points of the grid, each at all these turns:
+/// (points turns) x C x k x k.
 fn windows(
     grid: &Grid,
     query: &Tensor,
@@ -114,18 +149,50 @@ fn windows(
     rotated_windows(&query, margin, grid, sampling, points, &turns, rotations).flatten(0, 1)
 }
 
+/// The same of a query whose cells are those of the heightmap: windows of twice as many cells along each edge, whose middle is between
+/// cells as the points are.
+fn fine_windows(
+    grid: &Grid,
+    query: &Tensor,
+    points: &[Point2<f64>],
+    turns: &[usize],
+    rotations: usize,
+) -> Tensor {
+    let size = query.size();
+    let query = query.expand([points.len() as i64, size[1], size[2], size[3]], false);
+    let centers: Vec<_> = points
+        .iter()
+        .map(|point| point * 2.0 + Vector2::repeat(0.5))
+        .collect();
+    let turns = vec![turns.to_vec(); points.len()];
+    let (window, middle) = (2 * grid.window, grid.window as f64 - 0.5);
+    sampled_windows(
+        &query,
+        (window, middle),
+        grid.sampling,
+        &centers,
+        &turns,
+        rotations,
+    )
+    .flatten(0, 1)
+}
+
 /// Colour and height of a sample's observation, of v_{k-1} and of v_k, each 1 x 4 x rows x cols; and where something appeared.
 struct Cells {
     seen: Tensor,
     shown: Tensor,
     appeared: Tensor,
-    /// With two cells around it, so that it is told from a larger thing.
+    /// With 12 mm around it, so that it is told from a larger thing.
     around: Tensor,
 }
 
 impl Cells {
-    fn new(model: &Compared<'_>, sample: i64) -> Self {
-        let cells = model.fit.cells.each_ref();
+    fn new(model: &Compared<'_>, sample: i64, fineness: Fineness) -> Self {
+        let cells = match fineness {
+            Fineness::Grid => &model.fit.cells,
+            Fineness::Heightmap => &model.fit.fine_cells,
+        };
+        let cells = cells.each_ref();
         let [seen, before, shown] = cells.map(|cells| cells.narrow(0, sample, 1));
         let change = &shown - before;
         let rise = change.narrow(1, 3, 1);
@@ -134,7 +201,8 @@ impl Cells {
             .gt(RISEN)
             .logical_or(&recolored.logical_and(&rise.gt(-RISEN)))
             .to_kind(seen.kind());
-        let around = appeared.max_pool2d([5, 5], [1, 1], [2, 2], [1, 1], false);
+        let reach = 2 * fineness.factor();
+        let around = appeared.max_pool2d([2 * reach + 1; 2], [1, 1], [reach; 2], [1, 1], false);
         Self {
             seen,
             shown,
@@ -156,23 +224,26 @@ fn shape_difference(
     model: &Compared<'_>,
     sample: i64,
     crop: &Crop,
-    points: &[Point2<f64>],
-    turns: &[usize],
+    (points, turns): (&[Point2<f64>], &[usize]),
+    fineness: Fineness,
 ) -> Tensor {
-    let grid = model.grid;
+    let (grid, factor) = (model.grid, fineness.factor());
     let Cells {
         seen,
         shown,
         appeared,
         around,
-    } = Cells::new(model, sample);
+    } = Cells::new(model, sample, fineness);
     let relative = |image: &Tensor, row: usize, col: usize| {
         let heights = image.narrow(1, 3, 1);
-        let (first_row, first_col) = (row.max(1) - 1, col.max(1) - 1);
-        let last = |at: usize, len: usize| (at + 2).min(len) as i64;
-        let there = heights
-            .slice(2, first_row as i64, last(row, grid.rows), 1)
-            .slice(3, first_col as i64, last(col, grid.cols), 1);
+        let first = |at: usize| factor * (at.max(1) - 1) as i64;
+        let last = |at: usize, len: usize| factor * (at + 2).min(len) as i64;
+        let there = heights.slice(2, first(row), last(row, grid.rows), 1).slice(
+            3,
+            first(col),
+            last(col, grid.cols),
+            1,
+        );
         (heights - there.max()).clamp(-DEEPEST, DEEPEST)
     };
     let color = shown.narrow(1, 0, 3);
@@ -186,7 +257,11 @@ fn shape_difference(
         squares * -0.5,
         appeared,
     ];
-    let key = crop.of(&Tensor::cat(&key, 1).constant_pad_nd([grid.margin as i64; 4]));
+    // The middle of a cell of the grid is between cells of the heightmap.
+    let before = factor * grid.margin as i64;
+    let after = before + factor - 1;
+    let key = Tensor::cat(&key, 1).constant_pad_nd([before, after, before, after]);
+    let key = crop.scaled(&key, factor);
     let color = seen.narrow(1, 0, 3);
     let queries: Vec<Tensor> = points
         .iter()
@@ -202,11 +277,14 @@ fn shape_difference(
         })
         .collect();
     let query = Tensor::cat(&queries, 0);
-    let windows = windows(grid, &query, points, turns, model.rotations);
-    let edge = grid.window as i64;
+    let windows = match fineness {
+        Fineness::Grid => windows(grid, &query, points, turns, model.rotations),
+        Fineness::Heightmap => fine_windows(grid, &query, points, turns, model.rotations),
+    };
+    let edge = factor * grid.window as i64;
     let all = Tensor::ones([1, 1, edge, edge], (key.kind(), key.device()));
-    let area = correlate(&key.narrow(1, 7, 1), &all).clamp_min(1.0);
-    correlate(&key.narrow(1, 0, 7), &windows) / area
+    let area = strided(&key.narrow(1, 7, 1), &all, factor).clamp_min(1.0);
+    strided(&key.narrow(1, 0, 7), &windows, factor) / area
 }
 
 /// What differences of cells take from logits: weighted, and beyond that of what fits best.
@@ -232,7 +310,8 @@ fn fits(model: &Compared<'_>, sample: i64, candidates: &[usize], place: usize) -
     if model.pick_shape_weight == 0.0 {
         return learned;
     }
-    let differences = shape_difference(model, sample, &crop, &points, &turns);
+    let at = (&*points, &*turns);
+    let differences = shape_difference(model, sample, &crop, at, Fineness::Grid);
     let differences = best_of_each(&differences, candidates);
     // A cable has another shape wherever it lies.
     let is_like = differences.max().gt(-UNLIKE).to_kind(learned.kind());
@@ -248,12 +327,14 @@ struct Compared<'a> {
     rotations: usize,
     shape_weight: f64,
     pick_shape_weight: f64,
+    fine_shapes: bool,
 }
 
 impl<'a> Compared<'a> {
     fn new(grid: &'a Grid, features: &'a Features, config: &NetworkConfig) -> Option<Self> {
         let first = features.first.as_ref()?;
         let [shape_weight, pick_shape_weight] = config.shape_weights();
+        let fine_shapes = config.has_fine_shapes();
         Some(Self {
             grid,
             first,
@@ -262,6 +343,7 @@ impl<'a> Compared<'a> {
             rotations: config.rotations,
             shape_weight,
             pick_shape_weight,
+            fine_shapes,
         })
     }
 
@@ -272,9 +354,19 @@ impl<'a> Compared<'a> {
         cells.iter().map(point).collect()
     }
 
-    /// All turns.
-    fn turns(&self) -> Vec<usize> {
-        (0..self.rotations).collect()
+    /// What the cells add to the logits of turns and places in the crop, against all other places: turns x places x places.
+    fn turns_added(&self, sample: i64, crop: &Crop, pick: Point2<f64>) -> Tensor {
+        let turns: Vec<usize> = (0..self.rotations).collect();
+        let (fineness, at_most) = match self.fine_shapes {
+            false => (Fineness::Grid, MOST_TAKEN_OF_TURNS),
+            true => (Fineness::Heightmap, MOST_TAKEN_OF_FINE_TURNS),
+        };
+        let shape = shape_difference(self, sample, crop, (&[pick], &turns), fineness);
+        let added = taken(&shape, self.shape_weight, at_most) + at_most;
+        match self.fine_shapes {
+            false => added,
+            true => added * shape.max().gt(-UNLIKE_FINE).to_kind(shape.kind()),
+        }
     }
 
     /// Turns that candidates are compared at.
@@ -326,8 +418,7 @@ pub(crate) fn add_shape(
     let Some(model) = model else { return };
     let pick = pick_px.map(|coordinate_px| grid.index(coordinate_px));
     let crop = Crop::new(grid, model.place());
-    let shape = shape_difference(&model, 0, &crop, &[pick], &model.turns());
-    let taken = taken(&shape, model.shape_weight, MOST_TAKEN_OF_TURNS);
+    let added = model.turns_added(0, &crop, pick);
     // Places count from the margin's corner. Those beyond the last row or column are none.
     let places = Crop::places(grid, crop.edge);
     let rows = places.min(grid.rows as i64 - crop.row);
@@ -335,12 +426,7 @@ pub(crate) fn add_shape(
     let _ = logits
         .narrow(2, crop.row, rows)
         .narrow(3, crop.col, cols)
-        .g_add_(
-            &(taken + MOST_TAKEN_OF_TURNS)
-                .narrow(1, 0, rows)
-                .narrow(2, 0, cols)
-                .unsqueeze(0),
-        );
+        .g_add_(&added.narrow(1, 0, rows).narrow(2, 0, cols).unsqueeze(0));
 }
 
 /// What [`add_shape`] adds to the turns of the true picks at the true places: N x rotations, `None` where it adds nothing. Not learned.
@@ -358,19 +444,17 @@ pub(crate) fn turn_shapes(
             let pick = label.pick_px.map(|coordinate_px| grid.index(coordinate_px));
             let place = cell_of(grid, label.place_px);
             let crop = Crop::new(grid, place);
-            let turns = model.turns();
-            let shape = shape_difference(&model, sample as i64, &crop, &[pick], &turns);
+            let added = model.turns_added(sample as i64, &crop, pick);
             // The object may have been held a cell beside the point that was labelled.
             let within = |at: usize, begin: i64| {
                 (at as i64 - begin - 1).clamp(0, Crop::places(grid, crop.edge) - 3)
             };
             let (row, col) = (place / grid.cols, place % grid.cols);
             let around =
-                shape
+                added
                     .narrow(1, within(row, crop.row), 3)
                     .narrow(2, within(col, crop.col), 3);
-            let around = around.amax([1, 2].as_slice(), false);
-            taken(&around, model.shape_weight, MOST_TAKEN_OF_TURNS)
+            around.amax([1, 2].as_slice(), false)
         })
         .collect();
     Some(Tensor::stack(&shapes, 0))
@@ -426,6 +510,7 @@ pub(crate) fn candidate_loss(
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::input::rotation_angle;
     use crate::{Interpolation, Matching, Network};
 
     const GRID: Grid = Grid {
@@ -449,6 +534,14 @@ mod tests {
             }
         }
         Tensor::from_slice(&values).view([1, 1, GRID.rows as i64, GRID.cols as i64])
+    }
+
+    /// The same by cells of half the size, in four channels.
+    fn doubled(image: &Tensor) -> Tensor {
+        let size = [2 * GRID.rows as i64, 2 * GRID.cols as i64];
+        image
+            .upsample_nearest2d(size, None, None)
+            .expand([1, 4, -1, -1], false)
     }
 
     /// What a network would say whose features are the image itself, of squares that are seen and one that was shown at its place.
@@ -481,6 +574,7 @@ mod tests {
                     key: key.constant_pad_nd([GRID.margin as i64; 4]),
                     cells: [&seen, &seen.zeros_like(), &shown_image]
                         .map(|image| image.expand([1, 4, -1, -1], false)),
+                    fine_cells: [&seen, &seen.zeros_like(), &shown_image].map(doubled),
                 }),
                 done: Tensor::zeros([1], (Kind::Float, tch::Device::Cpu)),
             }),
@@ -556,6 +650,64 @@ mod tests {
         assert!(!picked(2.0 * MOST_TAKEN, 1000.0));
     }
 
+    /// A square of so many cells of the heightmap along its edge, turned about a point of the grid: 1 x 4 x rows x cols of the heightmap.
+    fn turned_square(edge: f64, (row, col): (f64, f64), turn: usize) -> Tensor {
+        let (rows, cols) = (2 * GRID.rows, 2 * GRID.cols);
+        let angle = -rotation_angle(turn, 36);
+        // Each cell as the mean of 8 x 8 points.
+        let points = || (0..8).map(|point| (f64::from(point) - 3.5) / 8.0);
+        let is_in = |row: f64, col: f64| {
+            let (sin, cos) = angle.sin_cos();
+            let (u, v) = (cos * col - sin * row, sin * col + cos * row);
+            u.abs().max(v.abs()) <= edge / 2.0
+        };
+        let mean = |at_row: usize, at_col: usize| {
+            let count = points()
+                .flat_map(|v| points().map(move |u| (v, u)))
+                .filter(|(v, u)| {
+                    is_in(
+                        at_row as f64 + v - 2.0 * row - 0.5,
+                        at_col as f64 + u - 2.0 * col - 0.5,
+                    )
+                })
+                .count();
+            count as f32 / 64.0
+        };
+        let cells: Vec<f32> = (0..rows * cols)
+            .map(|cell| mean(cell / cols, cell % cols))
+            .collect();
+        Tensor::from_slice(&cells)
+            .view([1, 1, rows as i64, cols as i64])
+            .expand([1, 4, -1, -1], false)
+    }
+
+    #[test]
+    fn a_small_square_shows_its_turn_by_the_cells_of_the_heightmap() {
+        let pick_px = Point2::new(GRID.coordinate_px(10.0), GRID.coordinate_px(10.0));
+        let seen = turned_square(8.3, (10.0, 10.0), 0);
+        let added = |shown: &Tensor| {
+            let mut features = features(&[(10, 10, 3)], (45, 22, 3));
+            let fit = features.first.as_mut().and_then(|first| first.fit.as_mut());
+            fit.unwrap().fine_cells = [&seen, &seen.zeros_like(), shown].map(Tensor::shallow_clone);
+            let logits = Tensor::zeros([1, 36, 60, 40], (Kind::Float, tch::Device::Cpu));
+            let mut config = config(4, [80.0, 0.0]);
+            if let Network::Matching(matching) = &mut config.network {
+                matching.fine_shapes = true;
+            }
+            add_shape(&GRID, &features, &config, pick_px, &logits);
+            logits
+        };
+        for turn in [0, 2, 4, 7] {
+            let logits = added(&turned_square(8.3, (45.0, 22.0), turn));
+            let best = logits.argmax(None, false).int64_value(&[]) as usize;
+            let at = (best / 2400 % 9, best / 40 % 60, best % 40);
+            assert_eq!(at, (turn, 45, 22));
+        }
+        // What keeps no shape says nothing.
+        let other = turned_square(20.0, (45.0, 22.0), 0);
+        assert_eq!(added(&other).abs().max().double_value(&[]), 0.0);
+    }
+
     #[test]
     fn the_turn_that_the_cells_say_is_what_the_loss_adds() {
         let features = turned_oblong();
@@ -596,8 +748,9 @@ mod tests {
         let (lying, standing) = (oblong(9..=11, 6..=14), oblong(41..=49, 21..=23));
         let mut features = features(&[(10, 10, 3)], (45, 22, 3));
         let fit = features.first.as_mut().and_then(|first| first.fit.as_mut());
-        fit.unwrap().cells = [&lying, &lying.zeros_like(), &standing]
-            .map(|image| image.expand([1, 4, -1, -1], false));
+        let (fit, images) = (fit.unwrap(), [&lying, &lying.zeros_like(), &standing]);
+        fit.cells = images.map(|image| image.expand([1, 4, -1, -1], false));
+        fit.fine_cells = images.map(doubled);
         features
     }
 

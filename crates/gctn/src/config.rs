@@ -206,6 +206,10 @@ pub struct Matching {
     /// no candidate is like what was moved. 0: nothing.
     #[serde(skip_serializing_if = "is_nothing")]
     pub pick_shape_weight: f64,
+    /// Whether turns are compared by the cells of the heightmap in place of those of stride 2: small things show no turn in these. A
+    /// larger `shape_weight` is right then.
+    #[serde(skip_serializing_if = "is_false")]
+    pub fine_shapes: bool,
     /// Edge length of the query window round the pick, in cells of stride 2. Odd.
     pub window_cells: usize,
     /// How the query window is rotated.
@@ -224,6 +228,7 @@ impl Default for Matching {
             candidates: 0,
             shape_weight: 0.0,
             pick_shape_weight: 0.0,
+            fine_shapes: false,
             window_cells: 21,
             rotation_sampling: Interpolation::Bilinear,
         }
@@ -245,6 +250,14 @@ fn is_zero(count: &usize) -> bool {
 )]
 fn is_nothing(weight: &f64) -> bool {
     *weight == 0.0
+}
+
+#[expect(
+    clippy::trivially_copy_pass_by_ref,
+    reason = "serde passes a reference"
+)]
+fn is_false(value: &bool) -> bool {
+    !value
 }
 
 /// How an image is sampled between its cells.
@@ -407,6 +420,11 @@ impl NetworkConfig {
         }
     }
 
+    /// Whether the cells of the heightmap themselves are compared for turns.
+    pub(crate) fn has_fine_shapes(&self) -> bool {
+        matches!(&self.network, Network::Matching(matching) if matching.fine_shapes)
+    }
+
     /// Whether both networks have the same weights: what compares candidates has none.
     pub(crate) fn has_weights_of(&self, other: &Self) -> bool {
         let without = |config: &Self| {
@@ -415,6 +433,7 @@ impl NetworkConfig {
                 matching.candidates = 0;
                 matching.shape_weight = 0.0;
                 matching.pick_shape_weight = 0.0;
+                matching.fine_shapes = false;
             }
             config
         };

@@ -23,20 +23,36 @@ pub(crate) fn rotated_windows(
     turns: &[Vec<usize>],
     rotations: usize,
 ) -> Tensor {
+    let centers: Vec<_> = centers
+        .iter()
+        .map(|center| center + Vector2::repeat(margin as f64))
+        .collect();
+    let window = (grid.window, grid.margin as f64);
+    sampled_windows(features, window, sampling, &centers, turns, rotations)
+}
+
+/// The same of features without a margin: windows of so many cells along each edge, with their middle at this index of theirs.
+pub(crate) fn sampled_windows(
+    features: &Tensor,
+    (window, middle): (usize, f64),
+    sampling: Interpolation,
+    centers: &[Point2<f64>],
+    turns: &[Vec<usize>],
+    rotations: usize,
+) -> Tensor {
     let size = features.size();
     let [samples, channels, rows, cols] = [size[0], size[1], size[2], size[3]];
-    let (window, turn_count) = (grid.window, turns[0].len());
+    let turn_count = turns[0].len();
     // Feature index -> [-1, 1] with -1 and 1 at the centres of the outermost cells.
     let normal = Vector2::new(2.0 / (cols - 1) as f64, 2.0 / (rows - 1) as f64);
     let mut points: Vec<f64> = Vec::with_capacity(2 * centers.len() * turn_count * window * window);
     for (center, turns) in centers.iter().zip(turns) {
-        let center = center.coords.add_scalar(margin as f64);
+        let center = center.coords;
         for turn in turns {
             let inverse = Rotation2::new(-rotation_angle(*turn, rotations));
             for row in 0..window {
                 for col in 0..window {
-                    let offset =
-                        Vector2::new(col as f64, row as f64).add_scalar(-(grid.margin as f64));
+                    let offset = Vector2::new(col as f64, row as f64).add_scalar(-middle);
                     let point = center + inverse * offset;
                     let point = match sampling {
                         Interpolation::Bilinear => point,

@@ -46,6 +46,7 @@ _DEFAULTS: dict[str, dict[str, Any]] = {
         "candidates": 0,
         "shape_weight": 0.0,
         "pick_shape_weight": 0.0,
+        "fine_shapes": False,
         "window_cells": 21,
         "rotation_sampling": "bilinear",
     },
@@ -59,6 +60,8 @@ _APART_CELLS, _SHIFT_CELLS, _TURN_STRIDE = 4.0, 3, 2
 # The cells themselves take at most so much from the logit of a candidate, and of a turn. They take nothing from candidates where the
 # best one differs by more than this. Heights count down to this below what is compared, and up to this above it (of 40 mm).
 _MOST_TAKEN, _MOST_TAKEN_OF_TURNS, _UNLIKE, _DEEPEST = 2.0, 4.0, 0.1, 0.5
+# The same of turns by the cells of the heightmap, which take nothing where the best turn differs by more than this.
+_MOST_TAKEN_OF_FINE_TURNS, _UNLIKE_FINE = 8.0, 0.2
 # What appeared has risen by more than this (of 40 mm), or its colour has changed by more than that (of 128, over three channels).
 _RISEN, _RECOLORED = 0.1, 0.5
 
@@ -86,6 +89,8 @@ class Features(NamedTuple):
     """Of ``matching``: query and key whose correlation is minus half the squared difference of what is seen and shown."""
     cells: tuple[torch.Tensor, torch.Tensor, torch.Tensor] | None = None
     """Of ``matching``: colour and height, 4 x rows x cols, of the observation, the previous goal and the goal."""
+    fine_cells: tuple[torch.Tensor, torch.Tensor, torch.Tensor] | None = None
+    """Of ``matching``: the same by the cells of the heightmap, two for each of these along rows and columns."""
 
 
 class Decision(NamedTuple):
@@ -308,64 +313,66 @@ class Network(nn.Module):
         row, col = (min(max(a - _SHIFT_CELLS, 0), whole + size // 2 * 2 - edge) for a, whole in zip(at, self.grid, strict=True))
         return row, col, edge
 
-    def _appeared(self, features: Features) -> tuple[torch.Tensor, torch.Tensor]:
-        """Where something appeared in the goal, 1 x rows x cols; and with two cells around it, so that it is told from a larger thing."""
-        assert features.cells is not None
-        _, before, shown = features.cells
-        change = shown - before
-        recolored = (change[:3].abs().sum(0) > _RECOLORED) & (change[3] > -_RISEN)
-        appeared = ((change[3] > _RISEN) | recolored).to(shown.dtype)[None]
-        return appeared, F.max_pool2d(appeared, 5, 1, 2)
-
-    def _cropped(self, key: torch.Tensor, crop: tuple[int, int, int]) -> torch.Tensor:
-        """What windows are compared with of a key without its margin."""
-        top, left, edge = crop
-        margin = self.config["network"]["window_cells"] // 2
-        return F.pad(key, (margin,) * 4)[None, :, top : top + edge, left : left + edge]
-
-    def _windows(self, query: torch.Tensor, center: Sequence[float], stride: int) -> torch.Tensor:
-        """Windows at every so manyth turn: turns x channels x size x size."""
+    def _windows(self, query: torch.Tensor, center: Sequence[float], stride: int, fine: bool = False) -> torch.Tensor:
+        """Windows at every so manyth turn: turns x channels x size x size. Fine ones have twice as many cells along each edge, and
+        their middle is between cells as the point is."""
         network, rotations = self.config["network"], self.config["rotations"]
         bilinear, size = network["rotation_sampling"] == "bilinear", network["window_cells"]
         turns = (2 * math.pi * turn / rotations for turn in range(0, rotations, stride))
-        return torch.stack([window(query, center, turn, size, bilinear) for turn in turns])
+        if fine:
+            center, size = [2 * at + 0.5 for at in center], 2 * size
+        return torch.stack([window(query, center, turn, size, bilinear, (size - 1) / 2) for turn in turns])
 
-    def _shape_difference(self, features: Features, centers: Sequence[Sequence[float]], stride: int) -> torch.Tensor:
+    def _shape_difference(self, features: Features, centers: Sequence[Sequence[float]], stride: int, fine: bool) -> torch.Tensor:
         """Minus half the squared difference between the cells at each point, at every so manyth turn, and those of the goal at the
         place: of colours where something appeared, and of heights there and around it; a mean over the cells where something appeared.
         Heights are relative to the point's and the place's own: an object may stand on another one. Points x turns x places x places.
         """
-        assert features.place is not None and features.cells is not None
-        rows, cols = self.grid
-        seen, _, shown = features.cells
-        appeared, around = self._appeared(features)
+        cells = features.fine_cells if fine else features.cells
+        assert features.place is not None and cells is not None
+        factor, (rows, cols) = 2 if fine else 1, self.grid
+        seen, before, shown = cells
+        change = shown - before
+        recolored = (change[:3].abs().sum(0) > _RECOLORED) & (change[3] > -_RISEN)
+        appeared = ((change[3] > _RISEN) | recolored).to(shown.dtype)[None]
+        # With 12 mm around it, so that it is told from a larger thing.
+        around = F.max_pool2d(appeared, 4 * factor + 1, 1, 2 * factor)
 
         def relative(image: torch.Tensor, row: int, col: int) -> torch.Tensor:
-            there = image[3, max(row - 1, 0) : row + 2, max(col - 1, 0) : col + 2].max()
-            return (image[3:] - there).clamp(-_DEEPEST, _DEEPEST)
+            near = (slice(factor * max(at - 1, 0), factor * (at + 2)) for at in (row, col))
+            return (image[3:] - image[(3, *near)].max()).clamp(-_DEEPEST, _DEEPEST)
 
         color, height = shown[:3], relative(shown, *divmod(int(features.place.argmax()), cols))
         squares = appeared * color.square().sum(0, keepdim=True) + around * height.square()
         key = torch.cat([appeared * color, -appeared / 2, around * height, -around / 2, -squares / 2, appeared])
-        key = self._cropped(key, self._crop(features.place))
         size = self.config["network"]["window_cells"]
-        area = F.conv2d(key[:, 7:8], torch.ones(1, 1, size, size)).clamp_min(1.0)[0]
+        margin = factor * (size // 2)
+        top, left, edge = (factor * at for at in self._crop(features.place))
+        # The middle of a cell of the grid is between cells of the heightmap.
+        key = F.pad(key, (margin, margin + factor - 1) * 2)[None, :, top : top + edge, left : left + edge]
+        all_cells = torch.ones(1, 1, factor * size, factor * size)
+        area = F.conv2d(key[:, 7:8], all_cells, stride=factor).clamp_min(1.0)[0]
         color = seen[:3]
         found = []
         for center in centers:
             col, row = (min(max(math.floor(at + 0.5), 0), end - 1) for at, end in zip(center, (cols, rows), strict=True))
             height = relative(seen, row, col)
             query = torch.cat([color, color.square().sum(0, keepdim=True), height, height.square(), torch.ones_like(height)])
-            found.append(F.conv2d(key[:, :7], self._windows(query, center, stride))[0] / area)
+            found.append(F.conv2d(key[:, :7], self._windows(query, center, stride, fine), stride=factor)[0] / area)
         return torch.stack(found)
 
     def _add_shape(self, features: Features, center: Sequence[float], logits: torch.Tensor) -> torch.Tensor:
         """Place logits with how well the cells at the pick, turned and shifted, fit what appeared at the place."""
         assert features.place is not None
         rows, cols = self.grid
-        shape = self._shape_difference(features, [center], 1)[0]
-        shape = (self.config["network"]["shape_weight"] * (shape - shape.max())).clamp_min(-_MOST_TAKEN_OF_TURNS)
-        added = torch.full_like(logits, -_MOST_TAKEN_OF_TURNS)
+        fine = self.config["network"]["fine_shapes"]
+        most = _MOST_TAKEN_OF_FINE_TURNS if fine else _MOST_TAKEN_OF_TURNS
+        shape = self._shape_difference(features, [center], 1, fine)[0]
+        # A cable has another shape wherever it lies.
+        if fine and shape.max() <= -_UNLIKE_FINE:
+            return logits
+        shape = (self.config["network"]["shape_weight"] * (shape - shape.max())).clamp_min(-most)
+        added = torch.full_like(logits, -most)
         top, left, _ = self._crop(features.place)
         high, wide = min(shape.shape[1], rows - top), min(shape.shape[2], cols - left)
         added[:, top : top + high, left : left + wide] = shape[:, :high, :wide]
@@ -374,7 +381,7 @@ class Network(nn.Module):
     def _taken(self, features: Features, peaks: Sequence[tuple[int, int]]) -> torch.Tensor:
         """What the cells themselves take from the logit of each candidate: their weighted difference beyond that of the candidate that
         fits best."""
-        differences = self._shape_difference(features, [[col, row] for row, col in peaks], _TURN_STRIDE).amax((1, 2, 3))
+        differences = self._shape_difference(features, [[col, row] for row, col in peaks], _TURN_STRIDE, False).amax((1, 2, 3))
         # A cable has another shape wherever it lies.
         if differences.max() <= -_UNLIKE:
             return torch.zeros_like(differences)
@@ -474,9 +481,11 @@ class Network(nn.Module):
         half_square = [x.square().sum(0, keepdim=True) / 2 for x in (seen_features, shown_features)]
         fit_query = torch.cat([seen_features, half_square[0], torch.ones_like(gate)])
         fit_key = F.pad(torch.cat([shown_features * gate, -gate, -gate * half_square[1]]), (margin,) * 4)
-        cells = tuple(F.avg_pool2d(x[:, start : start + 4], 2)[0] for start in (0, 4, 8))
+        observation, previous, goal = (x[0, start : start + 4] for start in (0, 4, 8))
+        fine = (observation, previous, goal)
+        cells = (F.avg_pool2d(observation, 2), F.avg_pool2d(previous, 2), F.avg_pool2d(goal, 2))
         done = (done * attention).sum()
-        return Features(pick, query, F.pad(key, (margin,) * 4), self._weight("scale"), place, done, (fit_query, fit_key), cells)
+        return Features(pick, query, F.pad(key, (margin,) * 4), self._weight("scale"), place, done, (fit_query, fit_key), cells, fine)
 
     def _hourglass(self, name: str, x: torch.Tensor) -> torch.Tensor:
         """ResNet43_8s of Ravens."""
@@ -525,9 +534,12 @@ def _cells(features: torch.Tensor, rows: torch.Tensor, cols: torch.Tensor) -> to
     return torch.where(inside, found, torch.zeros((), dtype=features.dtype))
 
 
-def window(features: torch.Tensor, center: Sequence[float], angle: float, size: int, bilinear: bool) -> torch.Tensor:
-    """What an object looks like that was turned by ``angle`` after it was picked at ``center`` (x, y in cells)."""
-    offsets = torch.arange(size, dtype=torch.float64) - size // 2
+def window(
+    features: torch.Tensor, center: Sequence[float], angle: float, size: int, bilinear: bool, middle: float | None = None
+) -> torch.Tensor:
+    """What an object looks like that was turned by ``angle`` after it was picked at ``center`` (x, y in cells), with the pick at the
+    index ``middle`` of the window, ``size // 2`` where it is not said."""
+    offsets = torch.arange(size, dtype=torch.float64) - (size // 2 if middle is None else middle)
     v, u = torch.meshgrid(offsets, offsets, indexing="ij")
     # Where the turned object now is at (u, v), the lying one was at R(-angle) (u, v).
     x = center[0] + math.cos(angle) * u + math.sin(angle) * v

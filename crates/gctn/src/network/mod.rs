@@ -54,6 +54,8 @@ pub(crate) struct Fit {
     pub key: Tensor,
     /// Colour and height (4 channels) of the observation, of v_{k-1} and of v_k, each N x 4 x rows x cols: not learned.
     pub cells: [Tensor; 3],
+    /// The same by the cells of the heightmap, two for each of these along rows and columns.
+    pub fine_cells: [Tensor; 3],
 }
 
 impl Features {
@@ -73,6 +75,7 @@ impl Features {
                     query: of(&fit.query),
                     key: of(&fit.key),
                     cells: fit.cells.each_ref().map(of),
+                    fine_cells: fit.fine_cells.each_ref().map(of),
                 }),
             }),
         }

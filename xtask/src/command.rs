@@ -83,7 +83,8 @@ pub fn output(command: &mut Command) -> Result<String> {
         .with_context(|| format!("`{shown}` printed text that is not UTF-8"))
 }
 
-fn shown(command: &Command) -> String {
+/// A command as a person would type it.
+pub fn shown(command: &Command) -> String {
     let mut text = command.get_program().to_string_lossy().into_owned();
     for argument in command.get_args() {
         let argument = argument.to_string_lossy();

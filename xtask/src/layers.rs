@@ -149,7 +149,6 @@ mod tests {
             name: name.to_owned(),
             folder: folder.into(),
             uses: uses.iter().map(|&name| name.to_owned()).collect(),
-            tests_use: BTreeSet::new(),
         }
     }
 

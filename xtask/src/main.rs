@@ -12,6 +12,7 @@ mod licences;
 mod packages;
 mod python;
 mod stage;
+mod unit_tests;
 
 use anyhow::Result;
 use clap::{Parser, Subcommand};

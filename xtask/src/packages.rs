@@ -12,10 +12,8 @@ pub struct Package {
     pub name: String,
     /// Relative to the repository root.
     pub folder: PathBuf,
-    /// Packages of the workspace that its library or program uses.
+    /// Packages of the workspace that its library or program uses; not those that only its tests use.
     pub uses: BTreeSet<String>,
-    /// Packages of the workspace that only its tests and benchmarks use.
-    pub tests_use: BTreeSet<String>,
 }
 
 #[derive(Deserialize)]
@@ -51,18 +49,15 @@ pub fn of_workspace() -> Result<Vec<Package>> {
             .and_then(|folder| folder.strip_prefix(&root).ok())
             .with_context(|| format!("{} lies outside", package.manifest_path.display()))?
             .to_owned();
-        let names = |for_tests: bool| {
-            package
-                .dependencies
-                .iter()
-                .filter(|dependency| (dependency.kind.as_deref() == Some("dev")) == for_tests)
-                .map(|dependency| dependency.name.clone())
-                .filter(|name| ours.contains(name))
-                .collect()
-        };
+        let uses = package
+            .dependencies
+            .iter()
+            .filter(|dependency| dependency.kind.as_deref() != Some("dev"))
+            .map(|dependency| dependency.name.clone())
+            .filter(|name| ours.contains(name))
+            .collect();
         packages.push(Package {
-            uses: names(false),
-            tests_use: names(true),
+            uses,
             name: package.name,
             folder,
         });
@@ -79,63 +74,24 @@ pub fn owner<'a>(packages: &'a [Package], file: &Path) -> Option<&'a Package> {
         .max_by_key(|package| package.folder.components().count())
 }
 
-/// The names of `changed` and of every package that uses one of them, directly or through others.
-pub fn with_dependents(packages: &[Package], changed: &BTreeSet<String>) -> BTreeSet<String> {
-    let mut reached = changed.clone();
-    loop {
-        let found: Vec<String> = packages
-            .iter()
-            .filter(|package| !reached.contains(&package.name))
-            .filter(|package| {
-                package
-                    .uses
-                    .union(&package.tests_use)
-                    .any(|name| reached.contains(name))
-            })
-            .map(|package| package.name.clone())
-            .collect();
-        if found.is_empty() {
-            return reached;
-        }
-        reached.extend(found);
-    }
-}
-
 #[cfg(test)]
 mod tests {
     use super::*;
 
-    fn package(name: &str, folder: &str, uses: &[&str]) -> Package {
+    fn package(name: &str) -> Package {
         Package {
             name: name.to_owned(),
-            folder: folder.into(),
-            uses: uses.iter().map(|&name| name.to_owned()).collect(),
-            tests_use: BTreeSet::new(),
+            folder: name.into(),
+            uses: BTreeSet::new(),
         }
     }
 
     #[test]
     fn a_file_belongs_to_the_innermost_package() {
-        let packages = [
-            package("bags", "bags", &[]),
-            package("bags-fuzz", "bags/fuzz", &["bags"]),
-        ];
+        let packages = [package("bags"), package("bags/fuzz")];
         let owner = |file: &str| owner(&packages, Path::new(file)).map(|p| p.name.as_str());
         assert_eq!(owner("bags/src/lib.rs"), Some("bags"));
-        assert_eq!(owner("bags/fuzz/src/main.rs"), Some("bags-fuzz"));
+        assert_eq!(owner("bags/fuzz/src/main.rs"), Some("bags/fuzz"));
         assert_eq!(owner("README.md"), None);
-    }
-
-    #[test]
-    fn a_change_reaches_what_uses_the_package_through_others() {
-        let packages = [
-            package("a", "a", &["b"]),
-            package("b", "b", &["c"]),
-            package("c", "c", &[]),
-            package("d", "d", &[]),
-        ];
-        let changed = BTreeSet::from(["c".to_owned()]);
-        let reached: Vec<_> = with_dependents(&packages, &changed).into_iter().collect();
-        assert_eq!(reached, ["a", "b", "c"]);
     }
 }

@@ -1,10 +1,11 @@
 //! The checks of `cargo xtask test`, in the order in which they run.
 
 use crate::command::{cargo, command, repository_root, run, target_directory};
-use crate::{layers, libtorch, licences, python};
+use crate::{layers, libtorch, licences, python, unit_tests};
 use anyhow::{Context as _, Result, ensure};
 use clap::ValueEnum;
 use std::path::PathBuf;
+use std::process::Command;
 use std::time::{Duration, Instant};
 
 /// One check.
@@ -53,27 +54,18 @@ impl Stage {
                 layers::check()?;
                 licences::check()
             }
-            Self::Clippy => run(cargo().args([
-                "clippy",
-                "--workspace",
-                "--all-targets",
-                "--release",
-                "--",
-                "-D",
-                "warnings",
-            ])),
+            Self::Clippy => run(&mut clippy()),
             Self::Doc => run(cargo()
                 .args(["doc", "--workspace", "--no-deps", "--release"])
                 .env("RUSTDOCFLAGS", "-D warnings")),
             Self::Unit => {
-                run(cargo().args(["test", "--workspace", "--release"]))?;
+                unit_tests::of_workspace()?;
                 fuzz_for_a_minute()?;
-                // The golden episodes have the same bits without optimisation.
-                run(cargo().args(["test", "-p", "multiravens", "--test", "golden"]))?;
+                golden_episodes_without_optimisation()?;
                 // The networks against numpy, which the environment has, and against PyTorch where there is one.
                 // Of the whole workspace, as above: for one crate alone Cargo would choose other features and compile again.
                 let cross_check = |judge: &str| {
-                    let test = ["test", "--workspace", "--release", "--lib"];
+                    let test = ["test", "--workspace", "--release", "--tests", "--quiet"];
                     run(cargo().args(test).args([judge, "--", "--ignored"]))
                 };
                 cross_check("what_numpy_says")?;
@@ -120,6 +112,45 @@ impl Stage {
             .map(|value| value.get_name().to_owned())
             .unwrap_or_default()
     }
+}
+
+/// clippy on everything; a warning fails.
+pub fn clippy() -> Command {
+    let mut clippy = cargo();
+    clippy
+        .args(["clippy", "--workspace", "--all-targets", "--release"])
+        .args(["--", "-D", "warnings"]);
+    clippy
+}
+
+/// Our packages that decide what happens in an episode.
+const SIMULATION: [&str; 6] = [
+    "camera_noise",
+    "collision",
+    "heightmap",
+    "multiravens",
+    "pick_place",
+    "ur5",
+];
+
+/// The golden episodes have the same bits without optimisation. Only our crates are built without it, and with what is checked in
+/// development: what is not ours is compiled once.
+fn golden_episodes_without_optimisation() -> Result<()> {
+    let mut test = cargo();
+    test.args(["test", "--workspace", "--release", "--test", "golden"]);
+    for package in SIMULATION {
+        for setting in [
+            "opt-level=0",
+            "debug-assertions=true",
+            "overflow-checks=true",
+        ] {
+            test.args([
+                "--config",
+                &format!("profile.release.package.{package}.{setting}"),
+            ]);
+        }
+    }
+    run(&mut test)
 }
 
 /// Mangled bags, guided by what they reach in the reader: see bags/README.md. What ends it stays in the target directory.

@@ -5,7 +5,7 @@ use nalgebra::{Isometry3, Point2, Point3, Vector3};
 use parry3d::math::{Pose, Rotation, Vector};
 use parry3d::shape::{Ball, Cuboid, Cylinder};
 use std::time::Duration;
-use ur5::{Arm, Body, JointTrajectory, Joints, Shape, WorkCell};
+use ur5::{Arm, Body, JointTrajectory, Joints, Shape, WorkCell, joints_text};
 
 /// Distances to keep.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -86,7 +86,7 @@ pub struct Clearance {
 /// A motion that must not be carried out.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 #[error(
-    "{} s after its start the motion brings {body} to {distance_m:.3} m from {obstacle}, expected {margin_m} m or more (joints {joints})",
+    "{} s after its start the motion brings {body} to {distance_m:.3} m from {obstacle}, expected {margin_m} m or more, with the joints at {joints}",
     time.as_secs_f64()
 )]
 pub struct Collision {
@@ -100,7 +100,7 @@ pub struct Collision {
     pub distance_m: f64,
     /// Distance to keep.
     pub margin_m: f64,
-    /// Joint positions there, in rad, as text.
+    /// Joint positions there, as text.
     pub joints: String,
 }
 
@@ -278,14 +278,13 @@ impl CollisionChecker {
         let links = self.arm.links(joints);
         let tip = links[TOOL] * self.arm.flange_from_tip;
         let collision = |body: &str, obstacle: String, distance_m: f64, margin_m: f64| {
-            let joints: Vec<String> = joints.iter().map(|q| format!("{q:.4}")).collect();
             Box::new(Collision {
                 time,
                 body: body.into(),
                 obstacle,
                 distance_m,
                 margin_m,
-                joints: joints.join(", "),
+                joints: joints_text(joints),
             })
         };
         let mut left_m = f64::INFINITY;

@@ -8,7 +8,7 @@ use heightmap::{Camera, Intrinsics, View};
 use nalgebra::Vector3;
 use pick_place::{ExecuteError, Outcome, PickPlace, PrimitiveSettings, Robot};
 use std::time::Duration;
-use ur5::{JointTrajectory, Joints, WorkCell};
+use ur5::{JointTrajectory, Joints, WorkCell, joints_text};
 
 /// The arm counts as home within this distance of each joint.
 const HOME_TOLERANCE_RAD: f64 = 1e-3;
@@ -58,7 +58,11 @@ pub enum CellError {
     #[error("a motion is under way")]
     Busy,
     /// A trajectory starts elsewhere.
-    #[error("the trajectory starts at {start}, the arm is at {present}")]
+    #[error(
+        "the trajectory starts at {}, the arm is at {}",
+        joints_text(start),
+        joints_text(present)
+    )]
     Jump {
         /// First joint position of the trajectory, in rad.
         start: Joints,

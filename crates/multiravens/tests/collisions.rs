@@ -64,10 +64,7 @@ fn rates_of_all_problems() {
         let (count, refused) = refusals(problem, &[10_000, 10_002, 10_004]);
         println!("{problem}: {count} actions, {} refused", refused.len());
         for reason in refused {
-            println!(
-                "  {}",
-                reason.split_whitespace().collect::<Vec<_>>().join(" ")
-            );
+            println!("  {reason}");
         }
     }
 }

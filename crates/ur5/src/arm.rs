@@ -6,9 +6,27 @@ use std::f64::consts::{FRAC_PI_2, PI, TAU};
 /// Joint positions in rad: shoulder pan, shoulder lift, elbow, wrist 1, wrist 2, wrist 3.
 pub type Joints = Vector6<f64>;
 
+/// A pose for people, on one line: position and rotation vector.
+pub(crate) fn pose_text(pose: &Isometry3<f64>) -> String {
+    let (position_m, rotation_rad) = (pose.translation.vector, pose.rotation.scaled_axis());
+    format!(
+        "({:.4}, {:.4}, {:.4}) m, rotation vector ({:.4}, {:.4}, {:.4}) rad",
+        position_m.x, position_m.y, position_m.z, rotation_rad.x, rotation_rad.y, rotation_rad.z
+    )
+}
+
+/// Joint positions for people, on one line.
+pub fn joints_text(joints_rad: &Joints) -> String {
+    let positions = joints_rad.iter().map(|position| format!("{position:.4}"));
+    format!("({}) rad", positions.collect::<Vec<_>>().join(", "))
+}
+
 /// A tip pose that no joint position within limits reaches.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
-#[error("no joint position within limits reaches the tip pose {tip}")]
+#[error(
+    "no joint position within limits reaches the tip pose {}",
+    pose_text(tip)
+)]
 pub struct Unreachable {
     /// The pose asked for, in the world.
     pub tip: Isometry3<f64>,

@@ -6,7 +6,7 @@ mod calibration;
 mod trajectory;
 mod work_cell;
 
-pub use arm::{Arm, DhLengths, Joints, LimitError, Solutions, Unreachable};
+pub use arm::{Arm, DhLengths, Joints, LimitError, Solutions, Unreachable, joints_text};
 pub use at_home::AtHome;
 pub use calibration::ArmCalibration;
 pub use trajectory::{JointTrajectory, PlanError, Sampler, TrajectoryPoint};

@@ -1,5 +1,6 @@
 //! Time-parameterised joint trajectories.
 
+use crate::arm::{joints_text, pose_text};
 use crate::{Arm, Joints, Unreachable};
 use nalgebra::{Isometry3, Translation3, UnitQuaternion, Vector6};
 use std::f64::consts::TAU;
@@ -33,7 +34,11 @@ pub enum PlanError {
     #[error(transparent)]
     Unreachable(#[from] Unreachable),
     /// The way leads through a singular position: joints would have to jump.
-    #[error("the straight way to {tip} is singular at joints {joints}")]
+    #[error(
+        "the straight way to {} is singular at joints {}",
+        pose_text(tip),
+        joints_text(joints)
+    )]
     Singular { tip: Isometry3<f64>, joints: Joints },
     /// Empty, out of order, not finite, or beyond the joint limits.
     #[error("invalid trajectory: {0}")]
@@ -786,6 +791,11 @@ mod tests {
         let from = arm.solve(&over(0.6, 0.0, 0.0, 0.1), &arm.ready).unwrap();
         let far = JointTrajectory::line(&arm, &from, &over(1.3, 0.0, 0.0, 0.1), 0.5, 2.0);
         assert!(matches!(far, Err(PlanError::Unreachable(_))), "{far:?}");
+        let reason = far.unwrap_err().to_string();
+        assert!(
+            reason.contains("tip pose (1.") && !reason.contains('\n'),
+            "{reason}"
+        );
         // Straight through the base's axis.
         let through = JointTrajectory::line(&arm, &from, &over(-0.6, 0.0, 0.0, 0.1), 0.5, 2.0);
         assert!(through.is_err());

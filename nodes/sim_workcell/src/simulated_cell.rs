@@ -167,9 +167,8 @@ impl SimulatedCell {
         until_contact: bool,
         tolerances_rad: &Joints,
     ) -> Result<(), Failure> {
-        let invalid = |reason: String| {
-            Failure::new(FollowJointTrajectoryResult::INVALID_GOAL, one_line(&reason))
-        };
+        let invalid =
+            |reason: String| Failure::new(FollowJointTrajectoryResult::INVALID_GOAL, reason);
         let servo = Servo::new(self.hardware.servo_delay_s, self.hardware.speed_scaling);
         let actual = servo
             .actual(&trajectory)
@@ -212,7 +211,7 @@ impl SimulatedCell {
                 Step::Ended(end)
             }
             Ok(Tick::Idle) => Step::Failed("there is no motion under way".into()),
-            Err(error) => Step::Failed(one_line(&error.to_string())),
+            Err(error) => Step::Failed(error.to_string()),
         }
     }
 
@@ -235,7 +234,7 @@ impl SimulatedCell {
     pub(crate) fn pass_time(&mut self, now: Duration) -> Result<(), String> {
         let passed = self.environment.cell_mut().pass_time();
         self.update_vacuum(now, false);
-        passed.map_err(|error| one_line(&error.to_string()))
+        passed.map_err(|error| error.to_string())
     }
 
     /// Stops the motion under way. An arm without inertia stands still at once; another one brakes: `step` goes on until it ends.
@@ -419,11 +418,6 @@ impl SimulatedCell {
             ..Default::default()
         }
     }
-}
-
-/// Vectors print themselves over several lines.
-fn one_line(text: &str) -> String {
-    text.split_whitespace().collect::<Vec<_>>().join(" ")
 }
 
 #[cfg(test)]

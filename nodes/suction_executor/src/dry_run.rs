@@ -200,14 +200,14 @@ impl RobotNow {
             motion: PlannedPrimitive::default(),
         };
         let (arm, settings) = (&self.arm, &HOME_SETTINGS);
-        go_home(&mut robot, arm, settings).map_err(|error| one_line(&error.to_string()))?;
+        go_home(&mut robot, arm, settings).map_err(|error| error.to_string())?;
         let lifted = self.lifted_out(pins.value.vacuum);
         let (carried, heightmap) = match &lifted {
             Some((carried, rest)) => (Some(*carried), Some(rest)),
             None => (None, self.without_arm.as_deref()),
         };
         rehearse_home(&self.checker, arm, settings, &joints, carried, heightmap)
-            .map_err(|error| format!("the way home: {}", one_line(&error.to_string())))?;
+            .map_err(|error| format!("the way home: {error}"))?;
         Ok(robot.motion)
     }
 
@@ -243,14 +243,9 @@ impl RobotNow {
             touchdown.as_ref(),
             |_| (),
         )
-        .map_err(|error| one_line(&error.to_string()))?;
+        .map_err(|error| error.to_string())?;
         Ok(robot.motion)
     }
-}
-
-/// Poses print themselves over several lines.
-fn one_line(text: &str) -> String {
-    text.split_whitespace().collect::<Vec<_>>().join(" ")
 }
 
 #[cfg(test)]

@@ -104,7 +104,7 @@ struct State {
     rate: f64,
 }
 
-/// Bag time against wall time.
+/// Bag time against wall time. The time of the wall is passed in.
 struct Pace {
     state: Arc<Mutex<State>>,
     /// At this moment of the wall...
@@ -118,13 +118,13 @@ impl Pace {
         *self.state.lock().unwrap_or_else(PoisonError::into_inner)
     }
 
-    /// Time of the bag now.
-    fn now(&self) -> Duration {
+    /// Time of the bag at a moment of the wall.
+    fn bag_time(&self, wall: Instant) -> Duration {
         let State { paused, rate } = self.state();
         if paused {
             return self.bag;
         }
-        self.bag + self.wall.elapsed().mul_f64(rate)
+        self.bag + wall.saturating_duration_since(self.wall).mul_f64(rate)
     }
 
     /// When a time of the bag comes; never while paused.
@@ -134,15 +134,16 @@ impl Pace {
         (!paused).then(|| self.wall + wait)
     }
 
-    /// Changes the state from now on.
-    fn change(&mut self, change: impl FnOnce(&mut State)) {
-        self.jump(self.now());
+    /// Changes the state from a moment of the wall on.
+    fn change(&mut self, wall: Instant, change: impl FnOnce(&mut State)) {
+        self.jump(wall, self.bag_time(wall));
         let mut state = self.state.lock().unwrap_or_else(PoisonError::into_inner);
         change(&mut state);
     }
 
-    fn jump(&mut self, bag: Duration) {
-        (self.wall, self.bag) = (Instant::now(), bag);
+    /// Goes on from a time of the bag.
+    fn jump(&mut self, wall: Instant, bag: Duration) {
+        (self.wall, self.bag) = (wall, bag);
     }
 }
 
@@ -312,7 +313,7 @@ impl Player {
     /// Plays once, or again and again.
     async fn passes(&mut self) -> Result<()> {
         loop {
-            self.pace.jump(self.begin);
+            self.pace.jump(Instant::now(), self.begin);
             self.publish_latched_before_begin()?;
             let asked_to_end = !self.pass().await?;
             if asked_to_end || !self.options.repeat {
@@ -336,15 +337,15 @@ impl Player {
                     order = self.asked.recv() => match order {
                         Some(Order::End) => return Ok(false),
                         Some(Order::Next) if self.pace.state().paused => {
-                            self.pace.jump(message.log_time);
+                            self.pace.jump(Instant::now(), message.log_time);
                             break;
                         }
-                        Some(order) => obey(order, &mut self.pace),
+                        Some(order) => obey(order, &mut self.pace, Instant::now()),
                         None => {}
                     },
                     _ = ticks.tick(), if self.clock.is_some() => {
                         if let Some(clock) = &self.clock {
-                            publish_clock(clock, self.pace.now());
+                            publish_clock(clock, self.pace.bag_time(Instant::now()));
                         }
                     }
                     () = until(due) => break,
@@ -417,8 +418,8 @@ fn chosen(bag: &BagReader, options: &PlayerOptions) -> Result<Vec<Topic>> {
     Ok(chosen)
 }
 
-fn obey(order: Order, pace: &mut Pace) {
-    pace.change(|state| match order {
+fn obey(order: Order, pace: &mut Pace, wall: Instant) {
+    pace.change(wall, |state| match order {
         Order::Pause(paused) => state.paused = paused,
         Order::Toggle => state.paused = !state.paused,
         Order::Rate(rate) => state.rate = rate,
@@ -571,30 +572,27 @@ fn serve(
 mod tests {
     use super::*;
 
-    fn pace(paused: bool, rate: f64) -> Pace {
-        Pace {
-            state: Arc::new(Mutex::new(State { paused, rate })),
-            wall: Instant::now(),
-            bag: Duration::from_secs(100),
-        }
-    }
-
-    #[tokio::test(start_paused = true)]
-    async fn bag_time_follows_the_rate_and_stands_still_while_paused() {
-        let mut pace = pace(false, 2.0);
-        assert_eq!(
-            pace.when(Duration::from_secs(110)).unwrap() - pace.wall,
-            Duration::from_secs(5)
-        );
-        tokio::time::advance(Duration::from_secs(1)).await;
-        assert_eq!(pace.now(), Duration::from_secs(102));
-        obey(Order::Pause(true), &mut pace);
-        tokio::time::advance(Duration::from_secs(1)).await;
-        assert_eq!(pace.now(), Duration::from_secs(102));
-        assert_eq!(pace.when(Duration::from_secs(103)), None);
-        obey(Order::Rate(0.5), &mut pace);
-        obey(Order::Toggle, &mut pace);
-        tokio::time::advance(Duration::from_secs(2)).await;
-        assert_eq!(pace.now(), Duration::from_secs(103));
+    #[test]
+    fn bag_time_follows_the_rate_and_stands_still_while_paused() {
+        let start = Instant::now();
+        let at = |seconds| start + Duration::from_secs(seconds);
+        let bag = Duration::from_secs;
+        let state = State {
+            paused: false,
+            rate: 2.0,
+        };
+        let mut pace = Pace {
+            state: Arc::new(Mutex::new(state)),
+            wall: start,
+            bag: bag(100),
+        };
+        assert_eq!(pace.when(bag(110)), Some(at(5)));
+        assert_eq!(pace.bag_time(at(1)), bag(102));
+        obey(Order::Pause(true), &mut pace, at(1));
+        assert_eq!(pace.bag_time(at(2)), bag(102));
+        assert_eq!(pace.when(bag(103)), None);
+        obey(Order::Rate(0.5), &mut pace, at(2));
+        obey(Order::Toggle, &mut pace, at(2));
+        assert_eq!(pace.bag_time(at(4)), bag(103));
     }
 }

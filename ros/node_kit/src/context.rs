@@ -1,10 +1,16 @@
 //! Where nodes live: the network they look for others on, and their common end.
 
 use std::{
+    collections::BTreeMap,
     env,
+    fs::{self, File},
     net::{IpAddr, Ipv4Addr, UdpSocket},
+    os::unix::fs::MetadataExt as _,
     process::{self, ExitCode},
-    sync::atomic::{AtomicU16, Ordering},
+    sync::{
+        Mutex, PoisonError,
+        atomic::{AtomicU16, Ordering},
+    },
     time::Duration,
 };
 
@@ -62,8 +68,32 @@ pub enum ContextError {
 /// The ports of domains above are among those that Linux hands out to anybody.
 const LAST_DOMAIN_ID: u16 = 100;
 
+/// Takes the lock of a domain id, which one process of this machine holds at a time until it ends: its ports tell of it only once it is
+/// in the domain. The tests in Python take the same lock.
+fn claim(domain_id: u16) -> bool {
+    static CLAIMS: Mutex<BTreeMap<u16, File>> = Mutex::new(BTreeMap::new());
+    let mut claims = CLAIMS.lock().unwrap_or_else(PoisonError::into_inner);
+    if claims.contains_key(&domain_id) {
+        return true;
+    }
+    let user = fs::metadata("/proc/self").map_or(0, |process| process.uid());
+    let path = env::temp_dir().join(format!("sctn_ros_domain_{user}_{domain_id}.lock"));
+    match File::options().create(true).append(true).open(path) {
+        Ok(lock) => {
+            let taken = lock.try_lock().is_ok();
+            if taken {
+                claims.insert(domain_id, lock);
+            }
+            taken
+        }
+        // Where no lock can be made the ports alone decide.
+        Err(_) => true,
+    }
+}
+
 impl Network {
-    /// This machine alone, in a domain whose discovery ports nobody has here; for each call another one.
+    /// This machine alone, in a domain whose discovery ports nobody has here, and which no other process was given; for each call
+    /// another one.
     pub fn unused() -> Result<Self, ContextError> {
         static CALLS: AtomicU16 = AtomicU16::new(0);
         let call = CALLS.fetch_add(1, Ordering::Relaxed) % LAST_DOMAIN_ID;
@@ -75,7 +105,7 @@ impl Network {
             .find(|id| {
                 // Of the domain, then of its participants (DDSI-RTPS 2.5, 9.6.2.3).
                 let first = 7400 + 250 * id;
-                (first..first + 2).chain(first + 10..first + 20).all(free)
+                (first..first + 2).chain(first + 10..first + 20).all(free) && claim(*id)
             })
             .ok_or(ContextError::NoUnusedDomain)?;
         Ok(Self {
@@ -361,6 +391,17 @@ mod tests {
         assert!(given.iter().all(|network| network.localhost_only));
         assert!(!given.contains(&taken));
         assert_ne!(given[0], given[1]);
+    }
+
+    #[test]
+    fn a_domain_that_another_process_was_given_is_not_unused() {
+        let given = Network::unused().unwrap();
+        let user = fs::metadata("/proc/self").unwrap().uid();
+        let lock = format!("sctn_ros_domain_{user}_{}.lock", given.domain_id);
+        let another = File::open(env::temp_dir().join(lock)).unwrap();
+        assert!(another.try_lock().is_err());
+        // Its own is not in its way.
+        assert!(claim(given.domain_id));
     }
 
     #[test]

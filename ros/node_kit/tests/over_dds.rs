@@ -16,7 +16,7 @@ use msgs::{
 };
 use node_kit::{
     ActionServer, Active, CallOptions, Context, GoalStatus, LifecycleClient, Network, NoParameters,
-    Node, Parameters, Publisher, Qos, Range, RosArguments, State, Transition,
+    Node, Parameters, Publisher, Qos, Range, RawQos, RosArguments, State, Transition,
 };
 use serde::{Deserialize, Serialize};
 use tokio::time::timeout;
@@ -48,6 +48,48 @@ fn image(number: u32) -> Image {
         data: vec![number as u8; 480 * 1920].into(),
         ..Image::default()
     }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn what_arrived_before_its_sender_ended_can_be_read_after_that() {
+    let network = Network::unused().unwrap();
+    let (sending, receiving) = (Context::new(network), Context::new(network));
+    let sender = node(&sending, "sender", "");
+    let receiver = node(&receiving, "receiver", "");
+    let mut subscription = receiver
+        .subscription::<Float64>("last_words", Qos::Event)
+        .unwrap();
+    let qos = RawQos {
+        reliable: true,
+        transient_local: false,
+        depth: 10,
+    };
+    let publisher = sender
+        .raw_publisher("last_words", "std_msgs/msg/Float64", qos)
+        .unwrap();
+    let heard = async {
+        while receiver.graph().publishers("/last_words") == 0
+            || sender.graph().subscriptions("/last_words") == 0
+        {
+            tokio::time::sleep(Duration::from_millis(20)).await;
+        }
+    };
+    timeout(LIMIT, heard).await.expect("both know each other");
+    publisher.publish(msgs::to_cdr(&Float64 { data: 7.0 }).unwrap());
+    let published = tokio::task::spawn_blocking(move || {
+        assert!(publisher.wait_until_heard(LIMIT));
+    });
+    published.await.unwrap();
+    sender.stop();
+    drop((sender, sending));
+    let gone = async {
+        while receiver.graph().publishers("/last_words") > 0 {
+            tokio::time::sleep(Duration::from_millis(20)).await;
+        }
+    };
+    timeout(LIMIT, gone).await.expect("the sender is gone");
+    let received = timeout(LIMIT, subscription.recv()).await;
+    assert_eq!(received.expect("last words").data, 7.0);
 }
 
 #[tokio::test(flavor = "multi_thread")]

@@ -215,7 +215,7 @@ impl Executor<'_> {
                 StepOutcome::Stopped,
                 format!("{phase:?}: {}", stopped.map_or("stopped", StopCause::text)),
             ),
-            Ok(Err(error)) => (StepOutcome::Fault, one_line(&error.to_string())),
+            Ok(Err(error)) => (StepOutcome::Fault, error.to_string()),
             Err(error) => (StepOutcome::Fault, format!("{error:#}")),
         };
         let broken_off = matches!(outcome, StepOutcome::Stopped | StepOutcome::Fault);
@@ -281,9 +281,4 @@ fn why(outcome: Outcome) -> &'static str {
         Outcome::Dropped => "the object was lost on the way",
         Outcome::LagAborted => "the tip lagged too far behind; the object was released",
     }
-}
-
-/// Poses print themselves over several lines.
-fn one_line(text: &str) -> String {
-    text.split_whitespace().collect::<Vec<_>>().join(" ")
 }

@@ -1,6 +1,6 @@
 use std::{
   cmp::max,
-  collections::{btree_map, BTreeMap, HashMap},
+  collections::{btree_map, BTreeMap, BTreeSet, HashMap},
   iter,
   ops::Bound::{Excluded, Included},
   sync::{Arc, Mutex},
@@ -154,6 +154,9 @@ pub(crate) struct TopicCache {
   // Therefore, data before the marker SN can be handed off to a Reliable DataReader.
   // Initially, we consider the marker for each Writer (GUID) to be SequenceNumber::new(1)
   received_reliably_before: BTreeMap<GUID, SequenceNumber>,
+
+  // Writers that are gone, but some of whose samples are still here.
+  departed_writers: BTreeSet<GUID>,
 }
 
 impl TopicCache {
@@ -170,6 +173,7 @@ impl TopicCache {
       last_added_instant: Timestamp::ZERO,
       sequence_numbers: BTreeMap::new(),
       received_reliably_before: BTreeMap::new(),
+      departed_writers: BTreeSet::new(),
     };
 
     new_self.update_keep_limits(topic_qos);
@@ -216,6 +220,7 @@ impl TopicCache {
   // have given up on a missing sample that the Reader is still waiting for.
   pub fn mark_reliably_received_before(&mut self, writer: GUID, sn: SequenceNumber) -> bool {
     let prev_sn = self.reliable_before(writer);
+    self.departed_writers.remove(&writer);
     // The entry must exist even at the initial value: withheld samples are
     // protected only for Writers that have one.
     let marker = self.received_reliably_before.entry(writer).or_default();
@@ -242,8 +247,14 @@ impl TopicCache {
   }
 
   // The Writer is gone, so samples it never completed are no longer awaited.
+  // Those before the marker are complete, and it has been told so: a DataReader
+  // may take them later, so the marker stays as long as they do.
   pub fn forget_reliable_writer(&mut self, writer: GUID) {
-    self.received_reliably_before.remove(&writer);
+    if self.sequence_numbers.contains_key(&writer) {
+      self.departed_writers.insert(writer);
+    } else {
+      self.received_reliably_before.remove(&writer);
+    }
   }
 
   // The oldest change that a Reliable DataReader cannot yet take, because an
@@ -253,6 +264,7 @@ impl TopicCache {
     self
       .received_reliably_before
       .iter()
+      .filter(|(writer, _)| !self.departed_writers.contains(writer))
       .filter_map(|(writer, marker)| {
         self
           .sequence_numbers
@@ -476,6 +488,9 @@ impl TopicCache {
     });
     if emptied {
       self.sequence_numbers.remove(&cc.writer_guid);
+      if self.departed_writers.remove(&cc.writer_guid) {
+        self.received_reliably_before.remove(&cc.writer_guid);
+      }
     }
   }
 
@@ -748,6 +763,35 @@ mod tests {
     assert!(topic_cache.mark_reliably_received_before(writer, SequenceNumber::new(10)));
     assert!(!topic_cache.mark_reliably_received_before(writer, SequenceNumber::new(5)));
     assert_eq!(topic_cache.reliable_before(writer), SequenceNumber::new(10));
+  }
+
+  // A process says its last words, hears that they have arrived, and ends before
+  // this one has taken them.
+  #[test]
+  fn what_a_departed_writer_completed_can_still_be_taken() {
+    let mut topic_cache = keep_all_topic_cache();
+    let writer = user_writer();
+    for sn in [1, 2, 4] {
+      add_after_missing_first(&mut topic_cache, writer, sn, 100);
+    }
+    topic_cache.mark_reliably_received_before(writer, SequenceNumber::new(3));
+    topic_cache.forget_reliable_writer(writer);
+    let taken: Vec<_> = topic_cache
+      .get_changes_in_range_reliable(&BTreeMap::new())
+      .map(|(_, cc)| cc.sequence_number)
+      .collect();
+    assert_eq!(taken, [SequenceNumber::new(1), SequenceNumber::new(2)]);
+    // Nothing waits for sample 3 any more.
+    assert_eq!(topic_cache.oldest_withheld_change(), None);
+    // With the last sample the marker goes, too.
+    let all: Vec<_> = topic_cache.changes.keys().copied().collect();
+    for instant in all {
+      if let Some(change) = topic_cache.changes.remove(&instant) {
+        topic_cache.remove_sn(&change);
+      }
+    }
+    assert!(topic_cache.received_reliably_before.is_empty());
+    assert!(topic_cache.departed_writers.is_empty());
   }
 
   // E.g. Fast DDS sends its first HEARTBEAT 3 s after matching, so a late joiner

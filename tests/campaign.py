@@ -222,10 +222,9 @@ def planted_campaign(only: str | None = None) -> dict[str, Violation | None]:
             except (TimeoutError, AssertionError) as error:
                 print(f"{planted}: the run hangs: {error}", file=sys.stderr, flush=True)
             found = bench.monitor.violations
-            # Later ones may be what comes of the first.
-            first = found[0] if found and found[0].kind == expected else None
+            first = next((violation for violation in found if violation.kind == expected), None)
             caught[planted] = first
-            said = f"MISSED {list(map(str, found[:1]))}"
+            said = f"MISSED {list(map(str, found[:3]))}"
             if first:
                 said = f"{expected.value} after {first.at_s - bench.exposed_by(first.at_s):.2f} s: {first}"
         print(f"{planted}: {fault.__name__}: {said}", file=sys.stderr, flush=True)

@@ -10,6 +10,7 @@ import random
 import socket
 import string
 import struct
+import time
 import urllib.parse
 from typing import Any
 
@@ -23,7 +24,13 @@ ROUTES = {
     "home": {},
     "step": {"step": 1},
     "lesson/begin": {},
-    "lesson/show": {"pick": {"x_m": 0.5, "y_m": 0.0, "yaw_rad": 0.0}, "place": {"x_m": 0.4, "y_m": 0.1, "yaw_rad": 0.0}, "preset": "rigid"},
+    "lesson/show": {
+        "pick": {"x_m": 0.5, "y_m": 0.0, "yaw_rad": 0.0},
+        "place": {"x_m": 0.4, "y_m": 0.1, "yaw_rad": 0.0},
+        "settings": {"clearance_m": 0.2, "lift_m": 0.1, "travel_m_s": 1, "carry_m_s": 0.5, "descend_m_s": 0.2, "acceleration_m_s2": 2},
+    },
+    "lesson/execute": {},
+    "lesson/change": {},
     "lesson/judge": {"reached": True},
     "lesson/undo": {},
     "lesson/save": {"name": "fuzz"},
@@ -97,6 +104,16 @@ class WebSocket:
                 return json.loads(data)
             if first & 0x0F == 8:
                 raise ConnectionError(f"closed: {data[2:].decode(errors='replace')}")
+
+    def receive_until(self, end: float) -> None:
+        """Takes what comes until a time of the monotonic clock."""
+        while (left := end - time.monotonic()) > 0:
+            self.socket.settimeout(left)
+            try:
+                self._more()
+            except TimeoutError:
+                break
+        self.socket.settimeout(10.0)
 
     def close(self) -> None:
         """Hangs up."""

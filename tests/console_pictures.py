@@ -56,6 +56,9 @@ def main() -> None:
             board = table.bounding_box()
             for right, down in ((0.257, 0.31), (0.19, 0.68)):
                 ada.page.mouse.click(board["x"] + right * board["width"], board["y"] + down * board["height"])
+            ada.button("Show the motion").click()
+            ada.can("Carry it out")
+            ada.page.wait_for_timeout(2000)
             picture(ada.page, folder, "teach")
             ada.button("Carry it out").click()
             ada.button("As it should be: keep this step").click()

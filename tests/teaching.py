@@ -24,6 +24,7 @@ os.environ.setdefault("RMW_IMPLEMENTATION", "rmw_fastrtps_cpp")
 
 from browser import Person, address_of, chromium
 from cell_operator import Operator, nanoseconds
+from playwright.sync_api import expect
 from processes import REPOSITORY, Process, free_domain
 from sctn_msgs.msg import Heightmap, PickPlace, StepResult
 from sctn_msgs.srv import ResetCell
@@ -100,27 +101,79 @@ def reset(operator: Operator, seed: int) -> None:
     operator.node.destroy_client(client)
 
 
-def click(person: Person, x_m: float, y_m: float) -> None:
-    """A click on the table at a place of the world frame."""
+def on_page(person: Person, x_m: float, y_m: float) -> tuple[float, float]:
+    """Where a place of the world frame is on the picture of the table, in pixels of the page."""
     table = person.page.get_by_role("img", name="The table now, from above")
     table.scroll_into_view_if_needed()
     box = table.bounding_box()
     # The robot looks up: x up, y to the left.
-    person.page.mouse.click(box["x"] + (0.5 - y_m) * box["width"], box["y"] + (0.75 - x_m) / 0.5 * box["height"])
+    return box["x"] + (0.5 - y_m) * box["width"], box["y"] + (0.75 - x_m) / 0.5 * box["height"]
 
 
-def show(person: Person, operator: Operator, shown: int) -> None:
-    """Shows a step of the task, counted from 0, by clicks."""
+def click(person: Person, x_m: float, y_m: float) -> None:
+    """A click on the table at a place of the world frame."""
+    person.page.mouse.click(*on_page(person, x_m, y_m))
+
+
+def drag(person: Person, begin_m: tuple[float, float], end_m: tuple[float, float]) -> None:
+    """Drags something on the table from one place of the world frame to another."""
+    person.page.mouse.move(*on_page(person, *begin_m))
+    person.page.mouse.down()
+    person.page.mouse.move(*on_page(person, *end_m), steps=4)
+    person.page.mouse.up()
+
+
+def show_by_keyboard(person: Person, operator: Operator, shown: int) -> None:
+    """Shows a step of the task, counted from 0, without a mouse."""
+    color, mark = TASK[shown]
+    keyboard = person.page.keyboard
+    person.page.get_by_label("Pick x").focus()
+    numbers = (*middle(operator.newest("heightmap"), color), *mark)
+    for number_m in numbers:
+        keyboard.type(str(round(1000 * number_m)))
+        keyboard.press("Tab")
+    keyboard.type("0")
+    results = operator.count("step_result")
+    keyboard.press("Enter")
+    # What comes next has the focus.
+    for name in ("Carry it out", "As it should be: keep this step"):
+        expect(person.button(name)).to_be_focused()
+        keyboard.press("Enter")
+    after = seen_since(operator, operator.next("step_result", results).header.stamp)
+    assert math.dist(middle(after, color), mark) < NEAR_M
+
+
+def choose(person: Person, operator: Operator, shown: int) -> None:
+    """Clicks pick and place of a step of the task, counted from 0."""
     color, mark = TASK[shown]
     person.sees(f"Lesson, {shown} {'step' if shown == 1 else 'steps'} so far. Click what to pick")
     click(person, *middle(operator.newest("heightmap"), color))
     person.sees("Now click where to place it.")
     click(person, *mark)
+
+
+def carry_out_and_keep(person: Person, operator: Operator, shown: int) -> None:
+    """Has the step that was chosen carried out, and keeps it."""
+    color, mark = TASK[shown]
     results = operator.count("step_result")
-    person.button("Carry it out").click()
+    person.button("Show the motion").click()
+    carry_out(person)
     after = seen_since(operator, operator.next("step_result", results).header.stamp)
     assert math.dist(middle(after, color), mark) < NEAR_M
     person.button("As it should be: keep this step").click()
+
+
+def show(person: Person, operator: Operator, shown: int) -> None:
+    """Shows a step of the task, counted from 0, by clicks."""
+    choose(person, operator, shown)
+    carry_out_and_keep(person, operator, shown)
+
+
+def carry_out(person: Person) -> None:
+    """Looks at the planned motion, and has it carried out."""
+    person.can("Carry it out")
+    expect(person.page.get_by_text(re.compile(r"The planned motion takes \d"))).to_be_visible()
+    person.button("Carry it out").click()
 
 
 def save(person: Person, name: str) -> None:

@@ -25,6 +25,8 @@ from test_operator_console import CLIENT, as_arguments, slow_down, until
 MOMENTS = int(os.environ.get("MOMENTS", "3"))
 # How long input is fuzzed.
 SECONDS = float(os.environ.get("SECONDS", "4"))
+# How long the idle console is watched.
+IDLE_S = 5.0
 # How long ten viewers watch.
 VIEWING_S = float(os.environ.get("VIEWING_S", "4"))
 
@@ -158,6 +160,9 @@ def test_random_input_of_somebody_with_the_token_moves_nothing_and_the_page_work
     requests, messages = 0, 0
     watcher: WebSocket | None = None
     while time.monotonic() < end:
+        if requests % 500 == 0:
+            # Her page is open.
+            ada.post("presence")
         path = generator.choice(list(ROUTES))
         status = post(connection, headers, path, spoiled(generator, ROUTES[path]))
         assert status < 500, f"seed {seed}: {path} answered {status}"
@@ -183,12 +188,28 @@ def test_random_input_of_somebody_with_the_token_moves_nothing_and_the_page_work
     ada.wait("awaiting_confirmation")
 
 
-def test_ten_viewers_and_a_slow_one_cost_no_memory_and_slow_nobody(start, tmp_path: pathlib.Path) -> None:
+def processor_s(process: Process) -> float:
+    """Time on a processor, of all threads."""
+    fields = pathlib.Path(f"/proc/{process.pid}/stat").read_text().rsplit(")", 1)[1].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+def test_an_idle_console_takes_little_and_ten_viewers_and_a_slow_one_cost_no_memory_and_slow_nobody(start, tmp_path: pathlib.Path) -> None:
     start("sctn", "launch", "--problem", "stacking", "--seed", 10016, "--operator", "none")
     process, address = console_process(start, tmp_path / "address")
     ada = CLIENT.Console(address, "Ada")
     ada.take_control()
     proposal = approvable(ada)
+    # A proposal waits, and one page is open.
+    page = WebSocket(address, ada._headers["X-Session"])
+    begin_s, begun_s = processor_s(process), time.monotonic()
+    while time.monotonic() < begun_s + IDLE_S:
+        page.send(b'{"type": "present", "visible": true}')
+        page.receive_until(time.monotonic() + 0.2)
+    share = (processor_s(process) - begin_s) / (time.monotonic() - begun_s)
+    page.close()
+    print(f"idle: {100 * share:.1f} % of a core")
+    assert share <= 0.02
 
     def presence_s() -> float:
         begin = time.monotonic()
@@ -210,10 +231,13 @@ def test_ten_viewers_and_a_slow_one_cost_no_memory_and_slow_nobody(start, tmp_pa
             assert {state["proposal"]["id"] for state in seen} == {proposal["id"]}
             took.append(presence_s())
 
-    watch(2.0)
+    # Until threads and buffers have their size.
+    watch(max(2.0, VIEWING_S / 10))
     before_kb = resident_kb(process)
     took.clear()
-    watch(VIEWING_S)
+    for part in range(10):
+        watch(VIEWING_S / 10)
+        print(f"after {(part + 1) * VIEWING_S / 10:.0f} s: {resident_kb(process)} kB", flush=True)
     grown_kb = resident_kb(process) - before_kb
     took.sort()
     median_s = took[len(took) // 2]

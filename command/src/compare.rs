@@ -7,8 +7,10 @@ use clap::Args;
 use gctn::{Goal, GoalConditioning, Policy};
 use heightmap::Heightmap;
 use learning::recorded_run;
+use nalgebra::Isometry2;
 use pick_place::PickPlace;
 use serde::Serialize;
+use std::fmt;
 use std::path::{Path, PathBuf};
 
 /// Arguments of `sctn compare`.
@@ -30,11 +32,23 @@ pub struct Compare {
 
 /// How far a proposal is from what was demonstrated.
 #[derive(Clone, Copy, Debug, Serialize)]
-struct Distance {
+pub struct Distance {
     pick_m: f64,
     place_m: f64,
     /// Between the turns of the object, 0 to pi; an object that looks the same turned may be turned otherwise.
     turn_rad: f64,
+}
+
+impl fmt::Display for Distance {
+    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
+        write!(
+            formatter,
+            "pick {:.1} mm, place {:.1} mm, turn {:.1} degrees",
+            1000.0 * self.pick_m,
+            1000.0 * self.place_m,
+            self.turn_rad.to_degrees()
+        )
+    }
 }
 
 impl Distance {
@@ -48,11 +62,41 @@ impl Distance {
     }
 }
 
-/// A demonstrated step, and how far each policy is from it.
+/// Where an object is picked or placed, in the world frame.
+#[derive(Clone, Copy, Debug, Serialize)]
+struct Pose {
+    x_m: f64,
+    y_m: f64,
+    yaw_rad: f64,
+}
+
+#[derive(Clone, Copy, Debug, Serialize)]
+struct Action {
+    pick: Pose,
+    place: Pose,
+}
+
+impl From<&PickPlace> for Action {
+    fn from(action: &PickPlace) -> Self {
+        let pose = |pose: &Isometry2<f64>| Pose {
+            x_m: pose.translation.x,
+            y_m: pose.translation.y,
+            yaw_rad: pose.rotation.angle(),
+        };
+        Self {
+            pick: pose(&action.pick),
+            place: pose(&action.place),
+        }
+    }
+}
+
+/// A demonstrated step, what each policy proposes for it, and how far that is from what was shown.
 #[derive(Debug, Serialize)]
 struct Step {
     demonstration: PathBuf,
     step: usize,
+    shown: Action,
+    proposed: Vec<Action>,
     distances: Vec<Distance>,
 }
 
@@ -86,21 +130,7 @@ impl Compare {
         if steps.is_empty() {
             bail!("--demos: no step that brought the table closer to the goal");
         }
-        let median = (0..policies.len()).map(|policy| {
-            let middle = |value: fn(&Distance) -> f64| {
-                let mut values: Vec<_> = steps
-                    .iter()
-                    .map(|step| value(&step.distances[policy]))
-                    .collect();
-                values.sort_by(f64::total_cmp);
-                values[values.len() / 2]
-            };
-            Distance {
-                pick_m: middle(|distance| distance.pick_m),
-                place_m: middle(|distance| distance.place_m),
-                turn_rad: middle(|distance| distance.turn_rad),
-            }
-        });
+        let median = (0..policies.len()).map(|policy| median(&steps, policy));
         let report = Report {
             median: median.collect(),
             checkpoints: self.checkpoints,
@@ -108,11 +138,8 @@ impl Compare {
         };
         for (checkpoint, distance) in report.checkpoints.iter().zip(&report.median) {
             println!(
-                "{}: pick {:.1} mm, place {:.1} mm, turn {:.1} degrees from {} demonstrated steps (median)",
+                "{}: {distance} from {} demonstrated steps (median)",
                 checkpoint.display(),
-                1000.0 * distance.pick_m,
-                1000.0 * distance.place_m,
-                distance.turn_rad.to_degrees(),
                 report.steps.len()
             );
         }
@@ -121,6 +148,36 @@ impl Compare {
         }
         Ok(())
     }
+}
+
+/// Median distances of a policy from the steps, by its index.
+fn median(steps: &[Step], policy: usize) -> Distance {
+    let middle = |value: fn(&Distance) -> f64| {
+        let mut values: Vec<_> = steps
+            .iter()
+            .map(|step| value(&step.distances[policy]))
+            .collect();
+        values.sort_by(f64::total_cmp);
+        values[values.len() / 2]
+    };
+    Distance {
+        pick_m: middle(|distance| distance.pick_m),
+        place_m: middle(|distance| distance.place_m),
+        turn_rad: middle(|distance| distance.turn_rad),
+    }
+}
+
+/// Median distances of a policy from the steps of demonstrations, and the number of the steps.
+pub fn held_out(policy: Policy, demos: &[PathBuf]) -> Result<(Distance, usize)> {
+    let policies = [policy];
+    let mut steps = Vec::new();
+    for path in demos {
+        compare(path, path, &policies, &mut steps)?;
+    }
+    if steps.is_empty() {
+        bail!("--held-out: no step that brought the table closer to the goal");
+    }
+    Ok((median(&steps, 0), steps.len()))
 }
 
 /// Has every policy propose for every step of a demonstration that brought the table closer to the goal, by the images of the
@@ -146,7 +203,7 @@ fn compare(path: &Path, shown: &Path, policies: &[Policy], steps: &mut Vec<Step>
     }
     for (index, (before, after)) in progress.into_iter().zip(goals) {
         let step = &demonstration.steps[index];
-        let distance = |policy: &Policy| {
+        let propose = |policy: &Policy| {
             let goal = match policy.config().conditioning {
                 GoalConditioning::Sequence => Goal::step(before, after),
                 GoalConditioning::NextStep => after.into(),
@@ -155,16 +212,21 @@ fn compare(path: &Path, shown: &Path, policies: &[Policy], steps: &mut Vec<Step>
                 ),
             };
             let decision = policy.decide(&step.observation, goal, &[])?;
-            let proposed = PickPlace {
+            Ok(PickPlace {
                 pick: decision.pick,
                 place: decision.place,
-            };
-            Ok(Distance::between(&proposed, &step.action))
+            })
         };
+        let proposed: Vec<_> = policies.iter().map(propose).collect::<Result<_>>()?;
         steps.push(Step {
             demonstration: path.to_owned(),
             step: index + 1,
-            distances: policies.iter().map(distance).collect::<Result<_>>()?,
+            shown: (&step.action).into(),
+            distances: proposed
+                .iter()
+                .map(|proposed| Distance::between(proposed, &step.action))
+                .collect(),
+            proposed: proposed.iter().map(Action::from).collect(),
         });
     }
     Ok(())
@@ -197,7 +259,7 @@ fn goals_of(demonstration: &Demonstration) -> Vec<(&Heightmap, &Heightmap)> {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use nalgebra::{Isometry2, Vector2};
+    use nalgebra::Vector2;
 
     #[test]
     fn distances_are_of_places_and_of_the_turn_of_the_object() {

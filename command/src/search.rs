@@ -2,7 +2,7 @@
 
 use crate::root::Root;
 use crate::sweep::write_whole;
-use crate::train::train;
+use crate::train::{Data, train};
 use anyhow::{Context, Result, bail, ensure};
 use clap::Args;
 use cpu_time::ProcessTime;
@@ -96,9 +96,12 @@ impl SearchCommand {
         let started = ProcessTime::now();
         let folder = self.out.join("trials").join(format!("{number:03}"));
         let resume = folder.join("state.safetensors").exists();
-        let demos = std::slice::from_ref(&self.demos);
         let shown = self.out.join("shown");
-        let snapshots = train(root, recipe.clone(), demos, &folder, &shown, resume)?;
+        let data = Data {
+            demos: std::slice::from_ref(&self.demos),
+            held_out: &[],
+        };
+        let snapshots = train(root, recipe.clone(), data, &folder, &shown, resume)?;
         let episodes = recipe.validation.episodes;
         let first = |rates: &BTreeMap<String, f64>| rates.values().next().copied().unwrap_or(0.0);
         let snapshots = snapshots.iter().map(|snapshot| TrialSnapshot {

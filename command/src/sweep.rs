@@ -2,7 +2,7 @@
 
 use crate::progress;
 use crate::root::Root;
-use crate::train::{Snapshot, train};
+use crate::train::{Data, Snapshot, train};
 use anyhow::{Context, Result};
 use clap::Args;
 use cpu_time::ProcessTime;
@@ -95,7 +95,10 @@ impl SweepCommand {
         let snapshots = train(
             root,
             recipe.clone(),
-            std::slice::from_ref(&self.demos),
+            Data {
+                demos: std::slice::from_ref(&self.demos),
+                held_out: &[],
+            },
             &folder,
             &self.shown(),
             resume,

@@ -1,5 +1,6 @@
 //! `sctn train`.
 
+use crate::compare;
 use crate::evaluate::summary;
 use crate::progress;
 use crate::root::Root;
@@ -39,6 +40,9 @@ pub struct Train {
     /// Problems in place of the recipe's
     #[arg(long, num_args = 1..)]
     problems: Vec<String>,
+    /// Bags that are not learned from, as for `sctn compare`: how far each snapshot is from their steps is told
+    #[arg(long, num_args = 1..)]
+    held_out: Vec<PathBuf>,
     /// Gradient steps in place of the recipe's
     #[arg(long)]
     steps: Option<u64>,
@@ -85,6 +89,7 @@ impl Train {
         }
         if let Some(steps) = self.steps {
             recipe.training.steps = steps;
+            recipe.snapshots = recipe.snapshots.min(steps);
         }
         if let Some(checkpoint) = self.start_from {
             recipe.network = Policy::load(&checkpoint)
@@ -95,7 +100,11 @@ impl Train {
         }
         let average = recipe.average as usize;
         let shown = self.out.join("shown");
-        let snapshots = train(root, recipe, &self.demos, &self.out, &shown, self.resume)?;
+        let data = Data {
+            demos: &self.demos,
+            held_out: &self.held_out,
+        };
+        let snapshots = train(root, recipe, data, &self.out, &shown, self.resume)?;
         let best = snapshots.iter().max_by(|a, b| {
             a.rank()
                 .partial_cmp(&b.rank())
@@ -176,17 +185,27 @@ fn load(demos: &[PathBuf], recipe: &mut Recipe, out: &Path) -> Result<DataSet> {
     Ok(data)
 }
 
+/// What is learned from, and what is not.
+#[derive(Clone, Copy)]
+pub struct Data<'a> {
+    /// A folder that `sctn demos` wrote, or recorded runs.
+    pub demos: &'a [PathBuf],
+    /// Bags with whose steps each snapshot is compared.
+    pub held_out: &'a [PathBuf],
+}
+
 /// Trains by a recipe in a folder, or goes on with what the folder holds; gives all snapshots. The demonstrations that validation
 /// shows are kept in the folder `shown`.
 pub fn train(
     root: &Root,
     mut recipe: Recipe,
-    demos: &[PathBuf],
+    data: Data<'_>,
     out: &Path,
     shown: &Path,
     resume: bool,
 ) -> Result<Vec<Snapshot>> {
     root.check_trainable(&recipe.problems)?;
+    let Data { demos, held_out } = data;
     let data = load(demos, &mut recipe, out)?;
     let [memory, file] = data.image_bytes().map(|bytes| bytes as f64 / 1e6);
     tracing::info!(
@@ -258,6 +277,16 @@ pub fn train(
             };
             (pick, place, count) = (0.0, 0.0, 0);
             bar.suspend(|| validate(root, training.recipe(), shown, &mut snapshot))?;
+            if !held_out.is_empty() {
+                gctn::set_threads(1);
+                let policy = Policy::load(&snapshot.checkpoint)?;
+                let (distance, steps) = compare::held_out(policy, held_out)?;
+                tracing::info!(
+                    "step {}: held out: {distance} from {steps} steps (median)",
+                    snapshot.step
+                );
+                gctn::set_threads(training.recipe().training.threads);
+            }
             for (problem, completion) in &snapshot.completion {
                 let tag = format!("validation/{problem}");
                 let scalars = [(tag.as_str(), *completion)];

@@ -55,19 +55,30 @@ impl PrimitiveSettings {
         acceleration_m_s2: 1.0,
     };
 
+    /// Smallest and largest value of each setting, by its name.
+    pub const RANGES: [(&'static str, f64, f64); 6] = [
+        ("clearance_m", 0.05, 0.5),
+        ("lift_m", 0.005, 0.5),
+        ("travel_m_s", 0.01, 1.5),
+        ("carry_m_s", 0.01, 1.5),
+        ("descend_m_s", 0.005, 0.5),
+        ("acceleration_m_s2", 0.1, 10.0),
+    ];
+
     /// Checks every range.
     ///
     /// # Errors
     /// The first setting outside its range, not-a-number included.
     pub fn check(&self) -> Result<(), SettingsError> {
-        for (name, value, low, high) in [
-            ("clearance_m", self.clearance_m, 0.05, 0.5),
-            ("lift_m", self.lift_m, 0.005, 0.5),
-            ("travel_m_s", self.travel_m_s, 0.01, 1.5),
-            ("carry_m_s", self.carry_m_s, 0.01, 1.5),
-            ("descend_m_s", self.descend_m_s, 0.005, 0.5),
-            ("acceleration_m_s2", self.acceleration_m_s2, 0.1, 10.0),
-        ] {
+        let values = [
+            self.clearance_m,
+            self.lift_m,
+            self.travel_m_s,
+            self.carry_m_s,
+            self.descend_m_s,
+            self.acceleration_m_s2,
+        ];
+        for ((name, low, high), value) in Self::RANGES.into_iter().zip(values) {
             if !(low..=high).contains(&value) {
                 return Err(SettingsError {
                     name,

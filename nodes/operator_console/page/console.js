@@ -3,7 +3,7 @@
 import { Api } from "./api.js";
 import { Arm } from "./arm.js";
 import { CameraViews } from "./cameras.js";
-import { board, draw, drawProposal, make, middleOfObject, pointed } from "./view.js";
+import { board, draw, drawObject, drawProposal, handTip, make, middleOfObject, pointed } from "./view.js";
 
 const ROBOT_MODES = {
   "-1": "no controller", 0: "disconnected", 1: "confirm safety", 2: "booting", 3: "power off", 4: "power on", 5: "idle",
@@ -39,10 +39,13 @@ let busy = false;
 let correction = null;
 /** Phase of the lesson that the page shows. */
 let lessonShown = "";
+/** Number of the library's change that the page shows. */
+let libraryShown = null;
 
 const api = new Api((next) => { state = next; render(); }, (word) => {
   if (word === "up" && link !== "up") {
-    loadLibrary();
+    libraryShown = null;
+    loadSettings();
     loadCheckpoints();
   }
   link = word;
@@ -87,6 +90,8 @@ function obstacle(action) {
     const operator = state.viewers.find((viewer) => viewer.operator);
     return operator ? `${operator.name} decides. You are watching.` : "You are watching. Take control to decide.";
   }
+  if (action === "go-home") return state.motion?.proposal_id === state.home?.proposal_id ? undefined : "The way home is being planned.";
+  if (state.home && !state.home.approved && action === "approve") return "The way home is shown: decide on it first.";
   if (state.lesson && action !== "home") return "A lesson is being given. Save it or end it first.";
   if (action === "teach") return state.phase === "moving" ? "The arm is moving." : undefined;
   if (action === "correct") return ["proposed", "awaiting_proposal"].includes(state.phase) ? undefined : "Nothing can be proposed now.";
@@ -109,6 +114,7 @@ async function act(action) {
   answer = "";
   // It is on its way before the page shows that it is.
   const asked = action === "home" ? api.post("home")
+    : action === "go-home" ? api.post("decisions", { proposal_id: state.home.proposal_id, decision: "approve" })
     : action === "teach" ? api.post("lesson/begin")
     : action === "continue" ? api.post("step", { step: state.goal.step })
     : api.post("decisions", { proposal_id: state.proposal?.id ?? "0", decision: action });
@@ -142,9 +148,10 @@ function endCorrection() {
 
 /** Numbers and drawing follow the correction. */
 function showCorrection() {
-  form.hidden = !correction;
-  $("correct").setAttribute("aria-expanded", String(Boolean(correction)));
-  document.body.classList.toggle("correcting", Boolean(correction));
+  const choosing = Boolean(correction) && (state.lesson?.phase ?? "choosing") === "choosing";
+  form.hidden = !choosing;
+  $("correct").setAttribute("aria-expanded", String(choosing));
+  document.body.classList.toggle("correcting", choosing);
   if (correction) {
     const { pick, place } = correction;
     const turn = pick && place ? turnOf(correction) : 0;
@@ -156,7 +163,8 @@ function showCorrection() {
   render();
 }
 
-form.addEventListener("input", () => {
+form.addEventListener("input", (event) => {
+  if (event.target.type !== "number") return;
   const number = (name) => form.elements[name].valueAsNumber;
   const next = { pick_x: number("pick_x"), pick_y: number("pick_y"), place_x: number("place_x"), place_y: number("place_y"), turn: number("turn") };
   if (!Object.values(next).every(Number.isFinite)) return;
@@ -169,13 +177,51 @@ form.addEventListener("input", () => {
 form.addEventListener("submit", async (event) => {
   event.preventDefault();
   await ask(async () => {
-    if (state.lesson) return api.post("lesson/show", { ...correction, preset: form.elements.preset.value });
+    if (state.lesson) return api.post("lesson/show", { ...correction, settings: chosenSettings() });
     await api.post("proposals", correction);
     endCorrection();
     $("approve").focus();
   });
 });
 $("cancel-correction").addEventListener("click", endCorrection);
+
+const SETTINGS = [
+  ["clearance_m", "Height above the table", 0.005, 1000, "mm"], ["lift_m", "Height while it carries", 0.005, 1000, "mm"],
+  ["travel_m_s", "Speed without an object", 0.01, 1000, "mm/s"], ["carry_m_s", "Speed while it carries", 0.01, 1000, "mm/s"],
+  ["descend_m_s", "Speed of the descent", 0.005, 1000, "mm/s"], ["acceleration_m_s2", "Acceleration", 0.1, 1, "m/s²"],
+];
+let offered = null;
+
+/** Presets and ranges of the motion of a lesson's step, as sliders. */
+async function loadSettings() {
+  offered = await api.get("lesson/settings").catch(() => null);
+  if (!offered || $("sliders").children.length) return;
+  for (const [name, words, step, factor, unit] of SETTINGS) {
+    const [min, max] = offered.ranges[name];
+    const slider = make("input", { type: "range", name, min, max, step });
+    const value = make("output", {});
+    const show = () => {
+      value.textContent = `${(factor * slider.valueAsNumber).toFixed(factor > 1 ? 0 : 1)} ${unit}`;
+      slider.setAttribute("aria-valuetext", value.textContent);
+    };
+    slider.addEventListener("input", show);
+    slider.addEventListener("preset", show);
+    $("sliders").append(make("label", {}, `${words} `, slider, value));
+  }
+  takePreset();
+}
+
+function takePreset() {
+  for (const [name, value] of Object.entries(offered?.presets[form.elements.preset.value] ?? {})) {
+    form.elements[name].value = value;
+    form.elements[name].dispatchEvent(new Event("preset"));
+  }
+}
+form.elements.preset.addEventListener("change", takePreset);
+
+function chosenSettings() {
+  return Object.fromEntries(SETTINGS.map(([name]) => [name, form.elements[name].valueAsNumber]));
+}
 
 /** Asks for something, and shows why it was not done. */
 async function ask(what) {
@@ -188,7 +234,10 @@ async function ask(what) {
   renderButtons();
 }
 
-// A lesson: pick and place are chosen as in a correction, and carried out at once.
+// A lesson: pick and place are chosen as in a correction, the planned motion is shown, and carried out when the person says so.
+$("execute").addEventListener("click", () => ask(() => api.post("lesson/execute")));
+$("change").addEventListener("click", () => ask(() => api.post("lesson/change")));
+$("leave-home").addEventListener("click", () => ask(() => api.post("decisions", { proposal_id: state.home.proposal_id, decision: "reject" })));
 $("reached").addEventListener("click", () => ask(() => api.post("lesson/judge", { reached: true })));
 $("missed").addEventListener("click", () => ask(() => api.post("lesson/judge", { reached: false })));
 $("undo").addEventListener("click", () => ask(() => api.post("lesson/undo")));
@@ -202,26 +251,30 @@ $("save-lesson").addEventListener("submit", (event) => {
   ask(async () => {
     await api.post("lesson/save", { name: name.value });
     answer = `Saved as ${name.value}.`;
-    await loadLibrary();
   });
 });
 
 const LESSON_WORDS = {
   choosing: "Click what to pick, then where to place it.",
   planning: "The executor plans the motion.",
+  previewing: "This is how the arm would move. Have it carried out, or change it.",
   moving: "The arm moves. Watch it; stop if anything is wrong.",
   looking: "The cameras look at the result.",
   judging: "Is this as it should be?",
 };
 
+/** What has the focus next in a lesson that is given by keyboard. */
+const LESSON_FOCUS = { previewing: "execute", judging: "reached" };
+
 function renderLesson() {
   const { lesson } = state;
+  const focused = $("lesson").contains(document.activeElement) || form.contains(document.activeElement);
   $("lesson").hidden = !lesson;
   document.body.classList.toggle("teaching", Boolean(lesson));
-  form.elements.preset.parentElement.hidden = !lesson;
+  form.elements.preset.parentElement.hidden = $("settings").hidden = !lesson;
   $("cancel-correction").hidden = Boolean(lesson);
-  setText($("send-correction"), lesson ? "Carry it out" : "Propose this");
-  setText($("correction-help"), lesson ? "Click what to pick, then where to place it; or type [mm, degrees]." : "Drag pick and place on the picture, or type [mm, degrees].");
+  setText($("send-correction"), lesson ? "Show the motion" : "Propose this");
+  setText($("correction-help"), lesson ? "Click what to pick, then where to place it, and drag the hand to turn it; or type [mm, degrees]." : "Drag pick, place and the hand of the turn on the picture, or type [mm, degrees].");
   if (!lesson) {
     if (lessonShown) {
       lessonShown = "";
@@ -235,21 +288,36 @@ function renderLesson() {
   const outcome = judging ? ` The arm ${lesson.outcome}.` : "";
   const undo = lesson.undoes ? " It takes the last step back." : "";
   setText($("lesson-state"), `Lesson, ${lesson.step_count} ${lesson.step_count === 1 ? "step" : "steps"} so far. ${LESSON_WORDS[lesson.phase]}${outcome}${undo}`);
-  const able = { reached: judging, missed: judging, undo: choosing && lesson.step_count > 0 };
+  const previewing = lesson.phase === "previewing";
+  const able = { execute: previewing, change: previewing || lesson.phase === "planning", reached: judging, missed: judging, undo: choosing && lesson.step_count > 0 };
   for (const [id, may] of Object.entries(able)) $(id).hidden = !may;
   $("save-lesson").hidden = !choosing || lesson.step_count === 0;
   $("end-lesson").hidden = lesson.phase === "moving";
   if (lessonShown !== lesson.phase) {
+    const over = ["", "judging"].includes(lessonShown);
+    // What was not carried out is changed; the next step is chosen anew: nothing is picked where nothing was clicked.
+    if (choosing && (over || !correction || !isOperator())) {
+      correction = state.heightmap && isOperator() ? { pick: null, place: null } : null;
+    }
     lessonShown = lesson.phase;
-    // The next step is chosen anew: nothing is picked where nothing was clicked.
-    correction = choosing && state.heightmap && isOperator() ? { pick: null, place: null } : null;
     showCorrection();
+    if (focused) (choosing && correction ? form.elements.pick_x : $(LESSON_FOCUS[lesson.phase] ?? "lesson-state")).focus();
   }
 }
 
+/** How runs of a task went. */
+function success({ runs }) {
+  const words = runs.map(({ checkpoint, completed, count }) => `${completed} of ${count} ${count === 1 ? "run" : "runs"} completed with ${checkpoint}`);
+  return words.join(", ") || "not repeated yet";
+}
+
+/** Names of corrections by the words for all of one problem. */
+let corrections = new Map();
+
 async function loadLibrary() {
-  const list = await api.get("demonstrations").catch(() => null);
-  if (!list) return;
+  const listed = await api.get("demonstrations").catch(() => null);
+  if (!listed) return;
+  const list = listed.tasks;
   setText($("library-note"), list.length ? "" : "No task has been saved yet.");
   const items = list.map((entry) => {
     const saved = new Date(1000 * entry.saved_at_s).toLocaleString();
@@ -266,19 +334,27 @@ async function loadLibrary() {
       pictures.append(container);
     }
     const words = `${entry.name}: ${entry.step_count} ${entry.step_count === 1 ? "step" : "steps"}, ${saved}`;
-    return make("li", {}, make("p", { textContent: words }), pictures, repeat);
+    return make("li", {}, make("p", { textContent: words }), make("p", { className: "small", textContent: success(entry) }), pictures, repeat);
   });
+  const focused = $("library").contains(document.activeElement) && document.activeElement.textContent;
   $("library").replaceChildren(...items);
+  [...$("library").querySelectorAll("button")].find((button) => button.textContent === focused)?.focus();
+  corrections = new Map();
+  for (const { name } of listed.corrections) {
+    const words = `corrections of ${name.split("-")[0]}`;
+    corrections.set(words, [...(corrections.get(words) ?? []), name]);
+  }
   // What is chosen stays so when the list is read again.
   const chosen = new Map([...document.querySelectorAll("#train-tasks select")].map((select) => [select.name, select.value]));
-  const choices = list.map(({ name }) => {
+  const choices = [...list.map(({ name }) => name), ...corrections.keys()].map((name) => {
     const select = make("select", { name });
     for (const [value, words] of [["", "leave out"], ["learn", "learn from"], ["held_out", "hold out"]]) select.append(make("option", { value, textContent: words }));
     select.value = chosen.get(name) ?? "";
-    return make("label", {}, `${name} `, select);
+    const count = corrections.get(name)?.length;
+    return make("label", {}, count ? `${count} ${name} ` : `${name} `, select);
   });
   $("train-tasks").replaceChildren($("train-tasks").firstElementChild, ...choices);
-  $("train").hidden = list.length < 2;
+  $("train").hidden = choices.length < 2;
 }
 
 async function loadCheckpoints() {
@@ -299,18 +375,41 @@ $("train").addEventListener("submit", (event) => {
   event.preventDefault();
   if (!isOperator()) return setText($("training-state"), "You are watching. Take control to train.");
   const { name, steps } = event.target.elements;
-  const tasks = (use) => [...document.querySelectorAll("#train-tasks select")].filter((select) => select.value === use).map((select) => select.name);
+  const tasks = (use) => [...document.querySelectorAll("#train-tasks select")].filter((select) => select.value === use).flatMap((select) => corrections.get(select.name) ?? [select.name]);
   ask(() => api.post("training/start", { name: name.value, steps: steps.valueAsNumber, learn: tasks("learn"), held_out: tasks("held_out") }));
 });
 $("cancel-training").addEventListener("click", () => ask(() => api.post("training/cancel")));
 
 let trainingShown = "";
 
+/** A distance from held-out steps, in words. */
+const distanceWords = ({ pick_m, place_m, turn_rad }) => [`${(1000 * pick_m).toFixed(1)} mm`, `${(1000 * place_m).toFixed(1)} mm`, `${(turn_rad / RADIANS).toFixed(1)}°`];
+
+/** Held-out steps side by side: as shown, by the new policy, and by the policy of now. */
+async function loadExamples(name) {
+  const examples = await api.get("training/comparison").catch(() => []);
+  const items = examples.map(({ demonstration, step, shown, new: proposed, now }) => {
+    const boardOf = ([words, action]) => {
+      const container = make("div", { className: "board" });
+      const { canvas, svg } = board(container, `${demonstration}, step ${step}, ${words}`);
+      api.heightmap(`demonstrations/${demonstration}/${step - 1}`).then((picture) => {
+        draw(canvas, picture, "color");
+        const map = state.heightmap;
+        if (map?.rows === picture.rows && map.cols === picture.cols) drawProposal(svg, map, picture, action);
+      }).catch(() => {});
+      return make("figure", {}, make("figcaption", { textContent: words }), container);
+    };
+    const boards = [["as shown", shown], [`by ${name}`, proposed], ["by the policy of now", now]].map(boardOf);
+    return make("li", {}, make("p", { textContent: `${demonstration}, step ${step}` }), make("div", { className: "triple" }, ...boards));
+  });
+  $("examples").replaceChildren(...items);
+}
+
 function renderTraining() {
   const { training } = state;
   const atWork = training?.phase === "training" || training?.phase === "comparing";
   $("cancel-training").hidden = $("training-progress").hidden = !atWork;
-  $("comparison").hidden = !training?.comparison;
+  $("comparison").hidden = $("examples").hidden = !training?.comparison;
   if (!training) return;
   $("training-progress").value = training.step / training.steps;
   const words = {
@@ -321,15 +420,22 @@ function renderTraining() {
     failed: `The training of ${training.name} failed: ${training.reason}`,
   };
   setText($("training-state"), words[training.phase]);
+  renderList($("validation"), training.validation, (snapshot) => [training.name, snapshot], (snapshot) => {
+    const [pick, place, turn] = distanceWords(snapshot);
+    return make("li", { textContent: `Step ${snapshot.step}: pick ${pick}, place ${place}, turn ${turn} from the held-out steps.` });
+  });
   const { comparison } = training;
   if (comparison) {
-    const row = (name, { pick_m, place_m, turn_rad }) => make("tr", {}, make("th", { scope: "row", textContent: name }),
-      ...[`${(1000 * pick_m).toFixed(1)} mm`, `${(1000 * place_m).toFixed(1)} mm`, `${(turn_rad / RADIANS).toFixed(1)}°`].map((textContent) => make("td", { textContent })));
+    const row = (name, distance) => make("tr", {}, make("th", { scope: "row", textContent: name }),
+      ...distanceWords(distance).map((textContent) => make("td", { textContent })));
     setText($("comparison").caption, `Median distance from ${comparison.steps} held-out ${comparison.steps === 1 ? "step" : "steps"}`);
     $("comparison").tBodies[0].replaceChildren(row(training.name, comparison.new), row("policy of now", comparison.now));
   }
   const phase = `${training.name} ${training.phase}`;
-  if (phase !== trainingShown && training.phase === "done") loadCheckpoints();
+  if (phase !== trainingShown && training.phase === "done") {
+    loadCheckpoints();
+    loadExamples(training.name);
+  }
   trainingShown = phase;
 }
 
@@ -344,7 +450,7 @@ function renderPolicy() {
 
 /** Drags what is nearest to the pointer: pick or place. */
 boards.now.svg.addEventListener("pointerdown", (event) => {
-  if (!correction) return;
+  if (!correction || form.hidden) return;
   const { svg } = boards.now;
   const [x_m, y_m] = pointed(state.heightmap, svg, event);
   const distance = (pose) => Math.hypot(pose.x_m - x_m, pose.y_m - y_m);
@@ -359,9 +465,14 @@ boards.now.svg.addEventListener("pointerdown", (event) => {
     }
     break;
   }
-  const dragged = distance(correction.pick) < distance(correction.place) ? correction.pick : correction.place;
+  const { pick, place } = correction;
+  const [tipX_m, tipY_m] = handTip(state.heightmap, correction);
+  const tipDistance = Math.hypot(tipX_m - x_m, tipY_m - y_m);
+  const dragged = tipDistance < Math.min(distance(pick), distance(place)) ? "turn" : distance(pick) < distance(place) ? "pick" : "place";
   const drag = (moved) => {
-    [dragged.x_m, dragged.y_m] = pointed(state.heightmap, svg, moved);
+    const [toX_m, toY_m] = pointed(state.heightmap, svg, moved);
+    if (dragged === "turn") place.yaw_rad = pick.yaw_rad + Math.atan2(toY_m - place.y_m, toX_m - place.x_m);
+    else Object.assign(correction[dragged], { x_m: toX_m, y_m: toY_m });
     showCorrection();
   };
   drag(event);
@@ -369,6 +480,16 @@ boards.now.svg.addEventListener("pointerdown", (event) => {
   svg.addEventListener("pointermove", drag);
   svg.addEventListener("pointerup", () => svg.removeEventListener("pointermove", drag), { once: true });
 });
+
+/** In a lesson the object under the cursor is outlined before it is picked. */
+boards.now.svg.addEventListener("pointermove", (event) => {
+  const picture = pictures.get("present");
+  if (form.hidden || !correction || correction.pick || !picture) return;
+  const { svg } = boards.now;
+  drawObject(svg, state.heightmap, picture, ...pointed(state.heightmap, svg, event));
+  svg.dataset.drawn = "object";
+});
+boards.now.svg.addEventListener("pointerleave", () => { if (boards.now.svg.dataset.drawn === "object") render(); });
 
 function changeOperator(change) {
   return ask(() => api.post("operator", change));
@@ -405,7 +526,7 @@ function renderRole() {
 }
 
 function renderButtons() {
-  for (const action of [...DECISIONS, "correct", "home", "continue", "teach"]) {
+  for (const action of [...DECISIONS, "correct", "home", "go-home", "continue", "teach"]) {
     $(action).setAttribute("aria-disabled", String(Boolean(obstacle(action))));
   }
   const stopped = state?.phase === "stopped";
@@ -419,6 +540,11 @@ function renderButtons() {
     if (!show && document.activeElement === button) $("headline").focus();
     button.hidden = !show;
   }
+  const { home } = state ?? {};
+  if ($("way-home").contains(document.activeElement) && (!home || home.approved)) $("headline").focus();
+  $("way-home").hidden = !home;
+  $("go-home").hidden = $("leave-home").hidden = !home || home.approved;
+  if (home) setText($("way-home-state"), home.approved ? "The arm goes home. Watch it; stop if anything is wrong." : "This is the way home: it is played below. Nothing moves before you approve it.");
   const main = judging ? "advance" : stopped ? "continue" : "approve";
   setText($("why"), answer || (lesson && isOperator() ? "" : obstacle(main)) || "");
   const stale = link !== "up" || (state?.phase === "proposed" && state.stale);
@@ -455,18 +581,23 @@ function renderPictures() {
   }
   setText($("goal-note"), state.goal ? `(step ${state.goal.step} of ${state.goal.step_count}, ${state.goal.module})` : "");
   if (correction && !state.lesson && !["proposed", "awaiting_proposal"].includes(state.phase)) return endCorrection();
-  const proposal = correction ?? (state.lesson ? null : ["proposed", "moving"].includes(state.phase) ? state.proposal : null);
-  const overlay = JSON.stringify([proposal, present?.number]);
-  if (map && boards.now.svg.dataset.drawn !== overlay) {
-    boards.now.svg.dataset.drawn = overlay;
-    drawProposal(boards.now.svg, map, present, proposal);
+  const shownStep = ["planning", "previewing", "moving"].includes(state.lesson?.phase) ? state.lesson : null;
+  const choosing = correction && !form.hidden;
+  const proposal = shownStep ?? (choosing ? correction : !state.lesson && ["proposed", "moving"].includes(state.phase) ? state.proposal : null);
+  for (const [name, at] of [["now", map], ["goal", goalMap]]) {
+    const { svg } = boards[name];
+    const overlay = JSON.stringify([proposal?.pick, proposal?.place, choosing, present?.number]);
+    if (!at || svg.dataset.drawn === overlay) continue;
+    svg.dataset.drawn = overlay;
+    drawProposal(svg, at, present, proposal, name === "now" && Boolean(choosing));
   }
   cameras.show(map, present, proposal);
   const metres = (pose) => `x ${pose.x_m.toFixed(3)} m, y ${pose.y_m.toFixed(3)} m`;
-  setText($("proposal"), correction
+  setText($("proposal"), choosing
     ? correction.pick && correction.place
       ? `Your pick at ${metres(proposal.pick)}. Your place at ${metres(proposal.place)}, turned by ${Math.round(turnOf(proposal))}°.`
       : correction.pick ? "Now click where to place it." : "Click what to pick."
+    : shownStep ? `Pick at ${metres(proposal.pick)}. Place at ${metres(proposal.place)}, turned by ${Math.round(turnOf(proposal))}°.`
     : proposal
     ? `Pick at ${metres(proposal.pick)}. Place at ${metres(proposal.place)}, turned by ${Math.round(turnOf(proposal))}°.${whose(proposal)}`
     : "");
@@ -499,7 +630,7 @@ function renderMotion() {
     robotAsked = true;
     api.text("robot_description").then((urdf) => { arm.load(urdf); motionFor = ""; render(); }).catch(() => { robotAsked = false; });
   }
-  const wanted = arm.ready && state.phase === "proposed" && state.motion ? state.proposal.id : "";
+  const wanted = arm.ready && state.motion ? state.motion.proposal_id : "";
   if (wanted !== motionFor) {
     motionFor = wanted;
     motion = null;
@@ -603,6 +734,7 @@ function renderRobot() {
     ["Robot mode", ROBOT_MODES[robot.robot_mode] ?? "unknown"],
     ["Safety", SAFETY_MODES[robot.safety_mode] ?? "unknown"],
     ["Program", robot.program_running == null ? "unknown" : robot.program_running ? "running" : "not running"],
+    ["Speed", robot.speed_scaling == null ? "unknown" : `${Math.round(100 * robot.speed_scaling)} % of the planned`],
     ["Suction", on(robot.suction)],
     ["Gripper", robot.vacuum == null ? "unknown" : robot.vacuum ? "holds something" : "empty"],
   ];
@@ -648,6 +780,10 @@ function renderDecision() {
 }
 
 function renderRest() {
+  if (state.library !== libraryShown) {
+    libraryShown = state.library;
+    loadLibrary();
+  }
   renderMotion();
   renderStrip();
   renderMessages();
@@ -658,7 +794,7 @@ function renderRest() {
   renderSteps();
 }
 
-for (const action of [...DECISIONS, "correct", "home", "continue", "teach"]) $(action).addEventListener("click", () => act(action));
+for (const action of [...DECISIONS, "correct", "home", "go-home", "continue", "teach"]) $(action).addEventListener("click", () => act(action));
 for (const radio of document.querySelectorAll("input[name=mode]")) radio.addEventListener("change", render);
 
 const KEYS = new Map([...document.querySelectorAll("[aria-keyshortcuts]")].map((button) => [button.getAttribute("aria-keyshortcuts"), button.id]));

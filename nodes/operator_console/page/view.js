@@ -1,6 +1,8 @@
 // Heightmaps as pictures. The robot stands below the picture and looks up: x up, y to the left.
 
 const SVG = "http://www.w3.org/2000/svg";
+/** Length of the hand that shows the turn, in cells. */
+const HAND = 14;
 /** Heights differ when they do by more [m]. */
 const HEIGHT_DIFFERS_M = 0.005;
 /** Colours differ when one of red, green and blue does by more. */
@@ -27,6 +29,12 @@ export function pointed(map, svg, event) {
 /** Picture, in cells, to world position. */
 export function toWorld(map, u, v) {
   return [map.origin_x_m + (map.cols - v) * map.pixel_size_m, map.origin_y_m + (map.rows - u) * map.pixel_size_m];
+}
+
+/** Where the hand that shows the turn of a correction ends, in the world frame. */
+export function handTip(map, { pick, place }) {
+  const [turn, length_m] = [place.yaw_rad - pick.yaw_rad, HAND * map.pixel_size_m];
+  return [place.x_m + length_m * Math.cos(turn), place.y_m + length_m * Math.sin(turn)];
 }
 
 /** A colour as a pixel of an image, opaque. */
@@ -140,8 +148,31 @@ function mark(svg, tag, kind, attributes) {
   element(tag, { ...attributes, class: kind, "stroke-width": 2 }, svg);
 }
 
-/** Draws pick, place, turn, and the object at its new pose. */
-export function drawProposal(svg, map, picture, proposal) {
+/** The outline of the object under a world position, moved to another one and turned. */
+function outline(map, picture, from, to, turn, svg) {
+  const [u, v] = toPicture(map, to.x_m, to.y_m);
+  const [cos, sin] = [Math.cos(turn), Math.sin(turn)];
+  const corner = (row, col) => {
+    // A turn about the world's z axis, from x (columns) to y (rows).
+    const [x, y] = [cos * col - sin * row, sin * col + cos * row];
+    return `${(u - y).toFixed(2)} ${(v - x).toFixed(2)}`;
+  };
+  const path = objectAt(map, picture, from.x_m, from.y_m).map(
+    ([row, first, last]) => `M${corner(row, first)}L${corner(row, last)}L${corner(row + 1, last)}L${corner(row + 1, first)}Z`,
+  );
+  element("path", { d: path.join(""), class: "object" }, svg);
+}
+
+/** Shows the object that a click would pick; nothing where there is none. */
+export function drawObject(svg, map, picture, x_m, y_m) {
+  svg.setAttribute("viewBox", `0 0 ${map.rows} ${map.cols}`);
+  svg.replaceChildren();
+  const at = { x_m, y_m };
+  outline(map, picture, at, at, 0, svg);
+}
+
+/** Draws pick, place, turn, and the object at its new pose; `handle`: the turn can be dragged. */
+export function drawProposal(svg, map, picture, proposal, handle = false) {
   svg.setAttribute("viewBox", `0 0 ${map.rows} ${map.cols}`);
   svg.replaceChildren();
   if (!proposal?.pick) return;
@@ -149,28 +180,20 @@ export function drawProposal(svg, map, picture, proposal) {
   const [pickU, pickV] = toPicture(map, pick.x_m, pick.y_m);
   const label = (text, u, v) => element("text", { x: Math.min(u + 8, map.rows - 30), y: Math.max(v - 7, 9), class: "mark" }, svg, text);
   if (!place) {
+    if (picture) outline(map, picture, pick, pick, 0, svg);
     mark(svg, "circle", "pick", { cx: pickU, cy: pickV, r: 6 });
     return label("Pick", pickU, pickV);
   }
   const [placeU, placeV] = toPicture(map, place.x_m, place.y_m);
   const turn = place.yaw_rad - pick.yaw_rad;
-  if (picture) {
-    const [cos, sin] = [Math.cos(turn), Math.sin(turn)];
-    const corner = (row, col) => {
-      // A turn about the world's z axis, from x (columns) to y (rows).
-      const [x, y] = [cos * col - sin * row, sin * col + cos * row];
-      return `${(placeU - y).toFixed(2)} ${(placeV - x).toFixed(2)}`;
-    };
-    const path = objectAt(map, picture, pick.x_m, pick.y_m).map(
-      ([row, first, last]) => `M${corner(row, first)}L${corner(row, last)}L${corner(row + 1, last)}L${corner(row + 1, first)}Z`,
-    );
-    element("path", { d: path.join(""), class: "object" }, svg);
-  }
+  if (picture) outline(map, picture, pick, place, turn, svg);
   mark(svg, "line", "way", { x1: pickU, y1: pickV, x2: placeU, y2: placeV, "stroke-dasharray": "5 3" });
   mark(svg, "circle", "pick", { cx: pickU, cy: pickV, r: 6 });
   mark(svg, "path", "place", { d: `M${placeU - 6} ${placeV}h12M${placeU} ${placeV - 6}v12` });
   // The turn: a hand that points where the object's x axis points.
-  mark(svg, "line", "place", { x1: placeU, y1: placeV, x2: placeU - 14 * Math.sin(turn), y2: placeV - 14 * Math.cos(turn) });
+  const [handU, handV] = [placeU - HAND * Math.sin(turn), placeV - HAND * Math.cos(turn)];
+  mark(svg, "line", "place", { x1: placeU, y1: placeV, x2: handU, y2: handV });
+  if (handle) mark(svg, "circle", "place", { cx: handU, cy: handV, r: 3.5 });
   label("Pick", pickU, pickV);
   label("Place", placeU, placeV);
 }

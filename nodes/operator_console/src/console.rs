@@ -1,5 +1,7 @@
 //! What HTTP handlers and the node share: the run, the people, and what is to be said to the graph.
 
+mod home;
+mod learn;
 mod teach;
 
 use std::collections::VecDeque;
@@ -7,16 +9,21 @@ use std::path::PathBuf;
 use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
+use bags::Demonstration;
 use msgs::convert;
 use msgs::sctn_msgs::{Heightmap, PickPlace, StepConfirmation, StepResult};
 use serde::Serialize;
 use step_protocol::StepOutcome;
 use tokio::sync::{mpsc, watch};
 
+use self::home::Home;
+use self::learn::Repetition;
 use self::teach::Planning;
+use crate::history::RunEvent;
 use crate::lesson::{Lesson, LessonState};
+use crate::preview::Motion;
 use crate::refusal::Refusal;
-use crate::run::{Decision, InvalidMessage, Phase, Pose, Run, Snapshot};
+use crate::run::{Decision, InvalidMessage, MotionState, Phase, Pose, Run, Snapshot};
 use crate::session::{Sessions, ViewerId, ViewerState};
 use crate::training::TrainingState;
 
@@ -34,10 +41,14 @@ pub enum Command {
     Home(String),
     /// Have the oracle latch this step again; for whom.
     SetStep(u32, String),
-    /// Have the oracle load the demonstration at this path; for whom.
-    Load(PathBuf, String),
+    /// Have the oracle load the demonstration of this name in the library, at this path; for whom.
+    Load(String, PathBuf, String),
     /// Have the policy load the checkpoint at this path; for whom.
     LoadCheckpoint(PathBuf, String),
+    /// Write down how a run of a demonstration of the library goes.
+    Record(RunEvent),
+    /// Keep a correction under this name.
+    Keep(Box<(String, Demonstration)>),
 }
 
 /// The state behind one lock.
@@ -48,8 +59,14 @@ pub struct State {
     pub sessions: Sessions,
     /// The lesson that is being given.
     lesson: Option<Lesson>,
-    /// The motion of the lesson that is approved as soon as it is planned.
+    /// The motion of the lesson that the executor has not planned yet.
     planning: Option<Planning>,
+    /// The way home that the executor has proposed.
+    home: Option<Home>,
+    /// The demonstration of the library that is repeated.
+    repetition: Option<Repetition>,
+    /// Counts the changes of what is on disk.
+    library_version: u64,
     /// The policy's checkpoint, once it was changed.
     pub policy: Option<PolicyState>,
     /// Proposal and decision of our own confirmations: what they change was changed when they were made.
@@ -84,6 +101,9 @@ struct Message<'a> {
     lesson: Option<LessonState>,
     policy: Option<PolicyState>,
     training: Option<TrainingState>,
+    library: u64,
+    home: Option<Home>,
+    motion: Option<MotionState<'a>>,
     #[serde(flatten)]
     run: Snapshot<'a>,
 }
@@ -97,6 +117,9 @@ impl Console {
                 sessions,
                 lesson: None,
                 planning: None,
+                home: None,
+                repetition: None,
+                library_version: 0,
                 policy: None,
                 sent: VecDeque::new(),
                 commands: None,
@@ -160,6 +183,9 @@ impl Console {
                 lesson: state.lesson.as_ref().map(Lesson::state),
                 policy: state.policy.clone(),
                 training,
+                library: state.library_version,
+                home: state.home,
+                motion: state.pending_motion().map(MotionState::from),
                 run: state.run.snapshot(now),
             })
         })
@@ -179,6 +205,13 @@ impl State {
         decision: Decision,
         now: Duration,
     ) -> Result<(), Refusal> {
+        if let Some(home) = self.home
+            && home.proposal_id == proposal_id
+            && !home.approved
+            && decision != Decision::Stop
+        {
+            return self.decide_home(viewer, home, decision, now);
+        }
         if decision != Decision::Stop {
             self.sessions.check_operator(viewer)?;
             self.check_no_lesson()?;
@@ -206,13 +239,43 @@ impl State {
 
     fn confirm(&mut self, confirmation: StepConfirmation, now: Duration) -> Result<(), Refusal> {
         self.send(Command::Confirm(confirmation.clone()))?;
-        self.run.on_confirmation(&confirmation, now);
+        self.heard_confirmation(&confirmation, now);
         if self.sent.len() == SENT {
             self.sent.pop_front();
         }
         let key = (confirmation.proposal_id, confirmation.decision);
         self.sent.push_back(key);
         Ok(())
+    }
+
+    fn heard_confirmation(&mut self, message: &StepConfirmation, now: Duration) {
+        self.run.on_confirmation(message, now);
+        // The executor withdraws the way home at a stop and at any other motion.
+        let StepConfirmation {
+            proposal_id,
+            decision,
+            ..
+        } = *message;
+        self.home.take_if(|home| match decision {
+            StepConfirmation::STOP => true,
+            StepConfirmation::APPROVE => home.proposal_id != proposal_id,
+            _ => false,
+        });
+        self.keep_corrections();
+    }
+
+    /// The planned motion of what waits for an approval: of the way home, of the step of a lesson, or of the present proposal.
+    pub fn pending_motion(&self) -> Option<&Motion> {
+        let id = if let Some(home) = self.home.filter(|home| !home.approved) {
+            home.proposal_id
+        } else if let Some(lesson) = &self.lesson {
+            lesson.pending()?.id
+        } else if self.run.phase() == Phase::Proposed {
+            self.run.current_id()?
+        } else {
+            return None;
+        };
+        self.run.motion_of(id)
     }
 
     fn check_no_lesson(&self) -> Result<(), Refusal> {
@@ -235,6 +298,20 @@ impl State {
         if let (Some(lesson), Some(view)) = (&mut self.lesson, self.run.present()) {
             lesson.on_heightmap(view);
         }
+        self.keep_corrections();
+        Ok(())
+    }
+
+    /// A proposal has come.
+    ///
+    /// # Errors
+    /// Names the field that makes no sense.
+    pub fn on_proposal(&mut self, message: PickPlace, now: Duration) -> Result<(), InvalidMessage> {
+        let is_new = self.run.proposal(message.id).is_none();
+        self.run.on_proposal(message)?;
+        if is_new {
+            self.propose_again(now);
+        }
         Ok(())
     }
 
@@ -244,6 +321,12 @@ impl State {
         let by_itself =
             result.outcome == StepOutcome::Stopped && self.run.phase() != Phase::Stopped;
         self.run.on_result(message, now)?;
+        let is_of_home = matches!(result.outcome, StepOutcome::AtHome | StepOutcome::NotHome);
+        self.home
+            .take_if(|home| is_of_home || home.proposal_id == message.proposal_id);
+        if result.outcome.motion().is_some() {
+            self.count_run(message.proposal_id);
+        }
         if by_itself && self.lesson.is_none() && self.run.phase() == Phase::Stopped {
             // The executor has stopped by itself, for instance because the operator was gone: everybody has to know that the run
             // is stopped, or it cannot be continued. While the console is inactive there is nobody to tell.
@@ -269,14 +352,19 @@ impl State {
     ///
     /// # Errors
     /// When somebody else decides, a lesson is being given, or the arm moves.
-    pub fn repeat(&mut self, viewer: ViewerId, path: PathBuf) -> Result<(), Refusal> {
+    pub fn repeat(
+        &mut self,
+        viewer: ViewerId,
+        demonstration: String,
+        path: PathBuf,
+    ) -> Result<(), Refusal> {
         self.sessions.check_operator(viewer)?;
         self.check_no_lesson()?;
         if self.run.phase() == Phase::Moving {
             return Err(Refusal::new("The arm is moving.", "Wait until it is back."));
         }
         let name = self.sessions.name(viewer).to_owned();
-        self.send(Command::Load(path, name))
+        self.send(Command::Load(demonstration, path, name))
     }
 
     /// The operator gives the policy another checkpoint, from the next proposal on.
@@ -319,28 +407,6 @@ impl State {
         Ok(id)
     }
 
-    /// The operator brings the arm home.
-    ///
-    /// # Errors
-    /// When somebody else decides.
-    pub fn home(&mut self, viewer: ViewerId) -> Result<(), Refusal> {
-        self.sessions.check_operator(viewer)?;
-        let name = self.sessions.name(viewer).to_owned();
-        self.send(Command::Home(name))
-    }
-
-    /// The way home that an operator has asked for is proposed: their asking is its approval.
-    pub(crate) fn approve_home(&mut self, proposal_id: u64, operator_name: String, now: Duration) {
-        let approval = StepConfirmation {
-            proposal_id,
-            decision: StepConfirmation::APPROVE,
-            operator_name,
-            ..StepConfirmation::default()
-        };
-        // While the console is inactive nothing is sent, and the arm stays.
-        let _ = self.confirm(approval, now);
-    }
-
     /// The operator continues the run with a step, the present one or another.
     ///
     /// # Errors
@@ -375,7 +441,7 @@ impl State {
             Some(index) => {
                 self.sent.remove(index);
             }
-            None => self.run.on_confirmation(message, now),
+            None => self.heard_confirmation(message, now),
         }
     }
 

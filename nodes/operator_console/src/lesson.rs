@@ -15,6 +15,8 @@ use crate::run::{Pose, View};
 
 /// Most steps of a lesson: each holds a heightmap.
 const MOST_STEPS: usize = 100;
+/// Most times that a motion is proposed again because another proposal has taken its place.
+const MOST_RENEWALS: u32 = 8;
 /// Longest name of a demonstration [characters].
 const LONGEST_NAME: usize = 40;
 
@@ -26,6 +28,8 @@ pub enum LessonPhase {
     Choosing,
     /// The executor plans the motion.
     Planning,
+    /// The planned motion is shown: the person has it carried out, or changes it.
+    Previewing,
     /// The arm moves.
     Moving,
     /// The arm has moved, and its result is not in view yet.
@@ -41,8 +45,10 @@ struct Trial {
     before: Arc<Heightmap>,
     /// It takes the last step back.
     undoes: bool,
-    /// It was planned and approved.
+    is_planned: bool,
     is_approved: bool,
+    /// How often it was proposed again.
+    renewals: u32,
     /// Outcome, and the end of the motion.
     ended: Option<(StepOutcome, Duration)>,
     after: Option<Arc<Heightmap>>,
@@ -75,9 +81,12 @@ pub struct LessonState {
     step_count: usize,
     /// How the last motion ended, in words; nothing before the first.
     outcome: Option<&'static str>,
-    /// The motion that is judged takes the last step back.
+    /// The motion takes the last step back.
     undoes: bool,
     unsaved: bool,
+    /// Pick and place of the motion that is planned, shown, carried out or judged.
+    pick: Option<Pose>,
+    place: Option<Pose>,
 }
 
 impl Lesson {
@@ -86,8 +95,13 @@ impl Lesson {
         match &self.trial {
             None => LessonPhase::Choosing,
             Some(Trial {
-                is_approved: false, ..
+                is_planned: false,
+                is_approved: false,
+                ..
             }) => LessonPhase::Planning,
+            Some(Trial {
+                is_approved: false, ..
+            }) => LessonPhase::Previewing,
             Some(Trial { ended: None, .. }) => LessonPhase::Moving,
             Some(Trial { after: None, .. }) => LessonPhase::Looking,
             Some(_) => LessonPhase::Judging,
@@ -103,7 +117,21 @@ impl Lesson {
             outcome: ended.map(|(outcome, _)| crate::run::outcome_words(outcome)),
             undoes: self.trial.as_ref().is_some_and(|trial| trial.undoes),
             unsaved: self.unsaved,
+            pick: self
+                .trial
+                .as_ref()
+                .map(|trial| Pose::from_msg(&trial.proposal.pick)),
+            place: self
+                .trial
+                .as_ref()
+                .map(|trial| Pose::from_msg(&trial.proposal.place)),
         }
+    }
+
+    /// The proposal of the motion that waits for its approval.
+    pub fn pending(&self) -> Option<&PickPlace> {
+        let trial = self.trial.as_ref().filter(|trial| !trial.is_approved)?;
+        Some(&trial.proposal)
     }
 
     fn check(&self, expected: LessonPhase) -> Result<(), Refusal> {
@@ -113,6 +141,10 @@ impl Lesson {
         let (reason, advice) = match self.phase() {
             LessonPhase::Choosing => ("Nothing has been shown.", "Choose pick and place first."),
             LessonPhase::Planning => ("The executor plans the motion.", "Wait a moment."),
+            LessonPhase::Previewing => (
+                "The planned motion is shown.",
+                "Have it carried out, or change it.",
+            ),
             LessonPhase::Moving => ("The arm is moving.", "Wait until it is back, or stop it."),
             LessonPhase::Looking => (
                 "The cameras have not shown the result yet.",
@@ -148,17 +180,46 @@ impl Lesson {
             proposal,
             before: Arc::clone(&before.heightmap),
             undoes,
+            is_planned: false,
             is_approved: false,
+            renewals: 0,
             ended: None,
             after: None,
         });
         Ok(())
     }
 
-    /// The motion that was begun is approved.
-    pub fn approve(&mut self) {
+    /// The executor has planned the motion that was begun.
+    pub fn planned(&mut self) {
         if let Some(trial) = &mut self.trial {
-            trial.is_approved = true;
+            trial.is_planned = true;
+        }
+    }
+
+    /// The person has the planned motion carried out. Returns its proposal, which has to be approved.
+    ///
+    /// # Errors
+    /// When there is no planned motion that waits.
+    pub fn execute(&mut self) -> Result<u64, Refusal> {
+        self.check(LessonPhase::Previewing)?;
+        let trial = self.trial.as_mut().ok_or_else(|| {
+            Refusal::new("Nothing has been shown.", "Choose pick and place first.")
+        })?;
+        trial.is_approved = true;
+        Ok(trial.proposal.id)
+    }
+
+    /// The person chooses pick and place anew.
+    ///
+    /// # Errors
+    /// When the motion is carried out already, or there is none.
+    pub fn change(&mut self) -> Result<(), Refusal> {
+        match self.phase() {
+            LessonPhase::Planning | LessonPhase::Previewing => {
+                self.trial = None;
+                Ok(())
+            }
+            _ => self.check(LessonPhase::Previewing),
         }
     }
 
@@ -170,6 +231,23 @@ impl Lesson {
     /// The motion that was approved is not carried out.
     pub fn forget_motion(&mut self) {
         self.trial.take_if(|trial| trial.ended.is_none());
+    }
+
+    /// Step number and attempt of the motion that waits, if it is proposed again; nothing where that was done too often.
+    pub fn next_renewal(&self) -> Option<(u32, u32)> {
+        let trial = self.trial.as_ref()?;
+        (trial.renewals < MOST_RENEWALS).then(|| self.next())
+    }
+
+    /// Somebody else's proposal has taken the place of the one that waits: it is proposed again, as another one made from `before`.
+    pub fn renew(&mut self, proposal: PickPlace, before: &View) {
+        self.trials += 1;
+        if let Some(trial) = &mut self.trial {
+            trial.proposal = proposal;
+            trial.before = Arc::clone(&before.heightmap);
+            trial.is_planned = false;
+            trial.renewals += 1;
+        }
     }
 
     /// Step number and attempt of the next motion.
@@ -188,7 +266,7 @@ impl Lesson {
         match result.outcome {
             StepOutcome::Refused | StepOutcome::Rejected => self.trial = None,
             outcome => {
-                trial.is_approved = true;
+                (trial.is_planned, trial.is_approved) = (true, true);
                 trial.ended = Some((outcome, result.stamp));
             }
         }
@@ -260,13 +338,9 @@ impl Lesson {
                 "Choose pick and place.",
             ));
         };
-        let pose = |pose: &msgs::geometry_msgs::Pose2D| Pose {
-            x_m: pose.x,
-            y_m: pose.y,
-            yaw_rad: pose.theta,
-        };
         let shown = last.proposal.clone();
-        Ok((pose(&shown.place), pose(&shown.pick), shown))
+        let (pick, place) = (Pose::from_msg(&shown.pick), Pose::from_msg(&shown.place));
+        Ok((place, pick, shown))
     }
 
     /// The steps as a demonstration. Each of them is worth the same.

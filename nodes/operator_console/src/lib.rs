@@ -6,6 +6,7 @@
 mod cameras;
 mod checkpoints;
 mod console;
+mod history;
 mod lesson;
 mod library;
 mod parameters;
@@ -35,7 +36,7 @@ use msgs::sctn_msgs::{
     ProposeHomeRequest, Reward, SetStep, SetStepRequest, StepConfirmation, StepResult,
 };
 use msgs::sensor_msgs::{Image, JointState};
-use msgs::std_msgs::{self, Bool, Header};
+use msgs::std_msgs::{self, Bool, Float64, Header};
 use msgs::ur_dashboard_msgs::{RobotMode, SafetyMode};
 use msgs::ur_msgs::{Digital, IOStates};
 use node_kit::{Active, CallOptions, Level, Node, Publisher, Qos, ServiceClient};
@@ -47,7 +48,7 @@ use tracing::{info, warn};
 use crate::cameras::Cameras;
 use crate::checkpoints::Checkpoints;
 use crate::console::{Command, Console, PolicyState};
-use crate::library::Library;
+use crate::library::Libraries;
 use crate::run::{Phase, Run, Watch};
 use crate::server::Access;
 use crate::session::Sessions;
@@ -111,7 +112,7 @@ pub async fn configure(
         load: Arc::new(
             node.service_client(&format!("{}/load_demonstration", parameters.goal_oracle))?,
         ),
-        library: Arc::new(Library::new(parameters.library.clone())),
+        libraries: Arc::new(Libraries::new(&parameters.library)),
         checkpoints: Arc::new(Checkpoints::new([
             parameters.checkpoints.clone(),
             parameters.training.clone(),
@@ -148,7 +149,7 @@ pub struct ConsoleNode {
     home: Arc<ServiceClient<ProposeHome>>,
     set_step: Arc<ServiceClient<SetStep>>,
     load: Arc<ServiceClient<LoadDemonstration>>,
-    library: Arc<Library>,
+    libraries: Arc<Libraries>,
     checkpoints: Arc<Checkpoints>,
     trainings: Arc<Trainings>,
     load_checkpoint: Arc<ServiceClient<LoadCheckpoint>>,
@@ -163,6 +164,11 @@ impl Active for ConsoleNode {
         if self.parameters.demonstration != Path::new("") {
             let path = self.parameters.demonstration.clone();
             show_demonstration(node, &self.console, path).await;
+        }
+        let libraries = Arc::clone(&self.libraries);
+        let open_run = node.spawn_blocking(move || libraries.history.open_run());
+        if let Some(run) = open_run.await.context("reading the history panicked")? {
+            self.console.change(|state, _| state.resume_run(run));
         }
         self.serve(node, &end).await?;
         self.follow_cameras(node, &end);
@@ -185,6 +191,8 @@ impl Active for ConsoleNode {
             node.subscription::<SafetyMode>(&io_and_status("safety_mode"), Qos::Latched)?;
         let mut running =
             node.subscription::<Bool>(&io_and_status("robot_program_running"), Qos::Latched)?;
+        let mut speeds =
+            node.subscription::<Float64>(&self.parameters.speed_scaling, Qos::Event)?;
         let mut motions = node.subscription::<PlannedMotion>("planned_motion", Qos::Latched)?;
         let mut scores = node.subscription::<Image>("pick_place/scores", Qos::Latched)?;
         let mut descriptions =
@@ -205,12 +213,12 @@ impl Active for ConsoleNode {
                     }
                 }
                 message = goals.recv() => {
-                    if let Err(reason) = console.change(|state, now| state.run.on_goal(message, now)) {
+                    if let Err(reason) = console.change(|state, now| state.on_goal(message, now)) {
                         goals.reject(reason);
                     }
                 }
                 message = proposals.recv() => {
-                    if let Err(reason) = console.change(|state, _| state.run.on_proposal(message)) {
+                    if let Err(reason) = console.change(|state, now| state.on_proposal(message, now)) {
                         proposals.reject(reason);
                     }
                 }
@@ -274,6 +282,11 @@ impl Active for ConsoleNode {
                 message = safety_modes.recv() => {
                     console.change(|state, _| state.run.on_robot(|robot| robot.safety_mode = Some(message.mode)));
                 }
+                message = speeds.recv() => {
+                    // The driver tells percents.
+                    let share = (message.data.is_finite()).then_some(message.data / 100.0);
+                    console.change_quietly(|state, _| state.run.on_robot(|robot| robot.speed_scaling = share));
+                }
                 message = running.recv() => {
                     console.change(|state, _| state.run.on_robot(|robot| robot.program_running = Some(message.data)));
                 }
@@ -315,7 +328,7 @@ impl ConsoleNode {
         );
         let router = server::router(
             Arc::clone(&self.console),
-            Arc::clone(&self.library),
+            Arc::clone(&self.libraries),
             Arc::clone(&self.checkpoints),
             Arc::clone(&self.trainings),
             Arc::clone(&self.cameras),
@@ -392,7 +405,7 @@ impl ConsoleNode {
                 self.proposals.publish(*proposal);
             }
             Command::Home(name) => {
-                info!("`{name}`: home");
+                info!("`{name}` asks for the way home");
                 self.publish_presence(node);
                 let (client, console) = (Arc::clone(&self.home), Arc::clone(&self.console));
                 node.spawn(async move {
@@ -403,21 +416,18 @@ impl ConsoleNode {
                         .await;
                     let reason = match answer {
                         Ok(answer) if answer.success => {
-                            if answer.needs_approval {
-                                let id = answer.proposal_id;
-                                console.change(|state, now| state.approve_home(id, name, now));
-                            }
-                            return;
+                            let (id, asks) = (answer.proposal_id, answer.needs_approval);
+                            return console.change(|state, _| state.on_home(id, asks));
                         }
                         Ok(answer) => answer.message,
                         Err(error) => error.to_string(),
                     };
                     let advice = refusal::advice(&reason);
-                    let text = format!("The arm did not go home: {reason}");
+                    let text = format!("There is no way home: {reason}");
                     console.change(|state, now| state.run.note("refusal", text, advice, now));
                 });
             }
-            Command::Load(path, name) => {
+            Command::Load(demonstration, path, name) => {
                 info!("`{name}`: repeat {}", path.display());
                 let (client, console) = (Arc::clone(&self.load), Arc::clone(&self.console));
                 let request = LoadDemonstrationRequest {
@@ -426,10 +436,13 @@ impl ConsoleNode {
                 };
                 let shown = node.clone();
                 node.spawn(async move {
-                    show_demonstration(&shown, &console, path).await;
+                    let goals = show_demonstration(&shown, &console, path).await;
                     let answer = client.call(&request, &CallOptions::default()).await;
                     let (kind, reason, advice) = match answer {
                         Ok(answer) if answer.success => {
+                            if let Some(goals) = goals {
+                                console.change(|state, _| state.on_loaded(demonstration, goals));
+                            }
                             ("note", format!("The run repeats {}.", answer.message), "")
                         }
                         Ok(answer) => (
@@ -481,6 +494,24 @@ impl ConsoleNode {
                     });
                 });
             }
+            Command::Record(event) => {
+                let libraries = Arc::clone(&self.libraries);
+                self.write(node, "how a run went", move || {
+                    libraries
+                        .history
+                        .add(event)
+                        .map_err(|error| error.to_string())
+                });
+            }
+            Command::Keep(correction) => {
+                let libraries = Arc::clone(&self.libraries);
+                let (name, demonstration) = *correction;
+                info!("correction {name}");
+                self.write(node, "a correction", move || {
+                    let saved = libraries.corrections.save(&name, &demonstration);
+                    saved.map_err(|refusal| refusal.reason)
+                });
+            }
             Command::SetStep(step, name) => {
                 info!("`{name}`: continue with step {step}");
                 let (client, console) = (Arc::clone(&self.set_step), Arc::clone(&self.console));
@@ -505,6 +536,28 @@ impl ConsoleNode {
     }
 }
 
+impl ConsoleNode {
+    /// Writes something of the library on a thread of its own; viewers are told.
+    fn write(
+        &self,
+        node: &Node,
+        what: &'static str,
+        write: impl FnOnce() -> Result<(), String> + Send + 'static,
+    ) {
+        let console = Arc::clone(&self.console);
+        node.spawn_blocking(move || match write() {
+            Ok(()) => console.change(|state, _| state.library_changed()),
+            Err(error) => {
+                warn!("{what} was not kept: {error}");
+                let reason =
+                    format!("What was learned from the run was not kept ({what}): {error}");
+                let advice = "Look at the parameter library and at the disk.";
+                console.change(|state, now| state.run.note("fault", reason, advice, now));
+            }
+        });
+    }
+}
+
 /// Name and goal images of a demonstration.
 fn read_demonstration(path: &Path) -> anyhow::Result<(String, Vec<Heightmap>)> {
     let demonstration = Demonstration::read(path)?;
@@ -515,15 +568,20 @@ fn read_demonstration(path: &Path) -> anyhow::Result<(String, Vec<Heightmap>)> {
     Ok((demonstration.name(), images.collect::<Result<_, _>>()?))
 }
 
-/// Shows the images of a demonstration before they are latched.
-async fn show_demonstration(node: &Node, console: &Console, path: PathBuf) {
+/// Shows the images of a demonstration before they are latched. Returns its name in the goals; nothing where it cannot be read.
+async fn show_demonstration(node: &Node, console: &Console, path: PathBuf) -> Option<String> {
     let reading = path.clone();
     let read = node.spawn_blocking(move || read_demonstration(&reading));
     match read.await.context("reading panicked").flatten() {
         Ok((name, images)) => {
-            console.change(|state, now| state.run.on_demonstration(name, images, now));
+            let shown = name.clone();
+            console.change(|state, now| state.run.on_demonstration(shown, images, now));
+            Some(name)
         }
-        Err(error) => warn!("demonstration {}: {error:#}", path.display()),
+        Err(error) => {
+            warn!("demonstration {}: {error:#}", path.display());
+            None
+        }
     }
 }
 

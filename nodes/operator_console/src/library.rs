@@ -1,4 +1,4 @@
-//! The folder of demonstrations that can be repeated.
+//! Folders of demonstrations: tasks that can be repeated, and corrections that can be learned from.
 
 use std::collections::BTreeMap;
 use std::path::{Path, PathBuf};
@@ -9,6 +9,7 @@ use bags::Demonstration;
 use heightmap::Heightmap;
 use serde::Serialize;
 
+use crate::history::{History, RunCount};
 use crate::lesson::check_name;
 use crate::refusal::Refusal;
 
@@ -26,6 +27,49 @@ pub struct Entry {
     pub step_count: usize,
     /// When it was saved: seconds since 1970.
     pub saved_at_s: u64,
+    /// How its runs went, for each checkpoint.
+    pub runs: Vec<RunCount>,
+}
+
+/// What a person has taught.
+#[derive(Debug)]
+pub struct Libraries {
+    /// Tasks that can be repeated.
+    pub tasks: Library,
+    /// Steps that a person has proposed in place of the policy, and that succeeded: each a demonstration of one step.
+    pub corrections: Library,
+    /// How runs of the tasks went.
+    pub history: History,
+}
+
+impl Libraries {
+    /// Corrections and the history lie in the folder of the tasks.
+    pub fn new(folder: &Path) -> Self {
+        Self {
+            tasks: Library::new(folder.to_owned()),
+            // No name of a task: those have no full stop.
+            corrections: Library::new(folder.join(".corrections")),
+            history: History::new(folder.join("runs.jsonl")),
+        }
+    }
+
+    /// All tasks, newest first, and how their runs went. Reads files.
+    pub fn tasks(&self) -> Vec<Entry> {
+        let mut entries = self.tasks.list();
+        let mut counts = self.history.counts();
+        for entry in &mut entries {
+            entry.runs = counts.remove(&entry.name).unwrap_or_default();
+        }
+        entries
+    }
+
+    /// The library with the demonstration of this name; that of the tasks where neither has it.
+    pub fn holding(&self, name: &str) -> &Library {
+        match self.tasks.has(name) || !self.corrections.has(name) {
+            true => &self.tasks,
+            false => &self.corrections,
+        }
+    }
 }
 
 /// The demonstrations of a folder.
@@ -57,6 +101,10 @@ impl Library {
                 "Look at the parameter library.",
             )
         })
+    }
+
+    fn has(&self, name: &str) -> bool {
+        self.path(name).is_ok_and(|path| path.is_dir())
     }
 
     /// All demonstrations, newest first. What is in the folder and is none is left out. Reads files.
@@ -144,5 +192,6 @@ fn read_entry(path: &Path, name: &str, changed: SystemTime) -> Option<Entry> {
         step_count: demonstration.goals().len(),
         problem: demonstration.problem,
         saved_at_s,
+        runs: Vec::new(),
     })
 }

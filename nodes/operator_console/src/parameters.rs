@@ -39,6 +39,7 @@ pub struct OperatorConsoleParameters {
     pub goal_oracle: String,
     pub policy: String,
     pub io_and_status: String,
+    pub speed_scaling: String,
     pub suction_pin: u8,
     pub vacuum_pin: u8,
 }
@@ -87,6 +88,7 @@ impl Default for OperatorConsoleParameters {
             goal_oracle: "goal_oracle".into(),
             policy: "gctn_policy".into(),
             io_and_status: "io_and_status_controller".into(),
+            speed_scaling: "speed_scaling_state_broadcaster/speed_scaling".into(),
             suction_pin: 16,
             vacuum_pin: 16,
         }
@@ -159,6 +161,7 @@ impl Parameters for OperatorConsoleParameters {
             ("goal_oracle", &self.goal_oracle),
             ("policy", &self.policy),
             ("io_and_status", &self.io_and_status),
+            ("speed_scaling", &self.speed_scaling),
         ] {
             if value.is_empty() {
                 return Err(InvalidParameter::new(name, "must not be empty"));

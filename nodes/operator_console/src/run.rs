@@ -1,6 +1,7 @@
 //! The run as the operator sees it: messages in, a snapshot out. No clock, no node.
 
 mod answer;
+mod correction;
 mod decide;
 mod health;
 mod outcome;
@@ -28,7 +29,7 @@ use crate::preview::{Motion, Scores};
 pub use self::decide::{Decision, Phase};
 pub(crate) use self::outcome::outcome_words;
 pub use self::propose::Pose;
-pub use self::snapshot::Snapshot;
+pub use self::snapshot::{MotionState, Snapshot};
 pub use self::view::View;
 
 /// Past steps that are shown.
@@ -80,6 +81,8 @@ struct PastStep {
     decided_by: String,
     before: Option<View>,
     after: Option<View>,
+    /// It was looked at whether it is a correction to learn from.
+    is_kept: bool,
 }
 
 #[derive(Clone, Debug, Serialize)]
@@ -362,6 +365,13 @@ impl Run {
             reason: reason.into(),
             advice: advice.into(),
         });
+    }
+
+    /// A proposal that has come, by its id.
+    pub fn proposal(&self, id: u64) -> Option<&PickPlace> {
+        let mut offered = self.offered.iter();
+        let found = offered.rfind(|known| known.message.id == id);
+        found.map(|known| &known.message)
     }
 
     fn offered(&mut self, id: u64) -> Option<&mut Offered> {

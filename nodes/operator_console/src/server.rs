@@ -27,7 +27,7 @@ use self::access::{Failure, guard, not_found, require_token};
 use crate::cameras::Cameras;
 use crate::checkpoints::Checkpoints;
 use crate::console::Console;
-use crate::library::Library;
+use crate::library::Libraries;
 use crate::training::Trainings;
 
 pub use self::access::Access;
@@ -87,7 +87,7 @@ const PAGE: [(&str, &str, &[u8]); 8] = [
 #[derive(Clone)]
 struct Shared {
     console: Arc<Console>,
-    library: Arc<Library>,
+    libraries: Arc<Libraries>,
     checkpoints: Arc<Checkpoints>,
     trainings: Arc<Trainings>,
     cameras: Arc<Cameras>,
@@ -100,7 +100,7 @@ struct Shared {
 /// The page and the API. Snapshots are made and WebSockets live until `end` is cancelled.
 pub fn router(
     console: Arc<Console>,
-    library: Arc<Library>,
+    libraries: Arc<Libraries>,
     checkpoints: Arc<Checkpoints>,
     trainings: Arc<Trainings>,
     cameras: Arc<Cameras>,
@@ -116,7 +116,7 @@ pub fn router(
     tokio::spawn(end.clone().run_until_cancelled_owned(making));
     let shared = Shared {
         console,
-        library,
+        libraries,
         checkpoints,
         trainings,
         cameras,
@@ -141,7 +141,10 @@ pub fn router(
         .route("/scores", get(pictures::scores))
         .route("/robot_description", get(pictures::robot_description))
         .route("/lesson/begin", post(lessons::begin_lesson))
+        .route("/lesson/settings", get(lessons::settings))
         .route("/lesson/show", post(lessons::show_step))
+        .route("/lesson/execute", post(lessons::execute_step))
+        .route("/lesson/change", post(lessons::change_step))
         .route("/lesson/judge", post(lessons::judge_step))
         .route("/lesson/undo", post(lessons::undo_step))
         .route("/lesson/save", post(lessons::save_lesson))
@@ -151,6 +154,7 @@ pub fn router(
         .route("/checkpoints/back", post(policies::use_previous_checkpoint))
         .route("/training/start", post(policies::start_training))
         .route("/training/cancel", post(policies::cancel_training))
+        .route("/training/comparison", get(policies::comparison))
         .route("/demonstrations", get(lessons::demonstrations))
         .route(
             "/demonstrations/{name}/{step}",
@@ -208,13 +212,13 @@ struct Named {
     name: String,
 }
 
-/// Work on the library's files.
+/// Work on the files of the libraries.
 async fn on_files<T: Send + 'static>(
     shared: &Shared,
-    work: impl FnOnce(&Library) -> T + Send + 'static,
+    work: impl FnOnce(&Libraries) -> T + Send + 'static,
 ) -> Result<T, Failure> {
-    let library = Arc::clone(&shared.library);
-    off_thread(move || work(&library)).await
+    let libraries = Arc::clone(&shared.libraries);
+    off_thread(move || work(&libraries)).await
 }
 
 /// Work on files, off the threads that serve.

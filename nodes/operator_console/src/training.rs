@@ -5,18 +5,20 @@ use std::process::Stdio;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use serde::{Deserialize, Serialize};
-use serde_json::Value;
 use tokio::io::{AsyncBufReadExt as _, AsyncReadExt as _, BufReader};
 use tokio::process::{Child, Command};
 use tokio_util::sync::CancellationToken;
 use tracing::{info, warn};
 
 use crate::refusal::Refusal;
+use crate::run::Pose;
 
 /// Most bytes of a report that are read.
 const LARGEST_REPORT: u64 = 1 << 20;
 /// Last words of a child that are shown when it fails.
 const WORDS: usize = 3;
+/// Most held-out steps that are shown as pictures.
+const EXAMPLES: usize = 24;
 
 /// How far a training is.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
@@ -45,10 +47,41 @@ pub struct TrainingState {
     /// Mean losses since the last snapshot, and the time left, in the words of `sctn train`; empty before the first.
     losses: String,
     left: String,
+    /// Median distances of the snapshots so far from the held-out steps.
+    validation: Vec<Validation>,
     /// Why it failed; empty where it did not.
     reason: String,
     /// Median distances of the new policy and of that of now from the held-out steps; nothing before they are measured.
     comparison: Option<Comparison>,
+}
+
+/// A snapshot that was compared with the held-out steps.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Validation {
+    /// Gradient steps before it.
+    step: u64,
+    #[serde(flatten)]
+    distance: Distance,
+}
+
+/// Pick and place of a step, in the world frame.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[allow(missing_docs)]
+pub struct Action {
+    pick: Pose,
+    place: Pose,
+}
+
+/// A held-out step: as it was shown, and as the two policies propose it.
+#[derive(Clone, Debug, PartialEq, Serialize)]
+pub struct Example {
+    /// Name of the demonstration.
+    demonstration: String,
+    /// Number of the step, from 1.
+    step: usize,
+    shown: Action,
+    new: Action,
+    now: Action,
 }
 
 /// Medians over held-out steps.
@@ -95,6 +128,8 @@ pub struct Trainings {
     /// The policy's checkpoint of now.
     start_from: Mutex<PathBuf>,
     state: Mutex<Option<(TrainingState, CancellationToken)>>,
+    /// The held-out steps of the last comparison.
+    examples: Mutex<Vec<Example>>,
 }
 
 impl Trainings {
@@ -106,7 +141,14 @@ impl Trainings {
             folder,
             start_from: Mutex::new(start_from),
             state: Mutex::new(None),
+            examples: Mutex::default(),
         }
+    }
+
+    /// The held-out steps of the last comparison, at most 24.
+    pub fn examples(&self) -> Vec<Example> {
+        let examples = self.examples.lock();
+        examples.unwrap_or_else(PoisonError::into_inner).clone()
     }
 
     /// The policy has been given another checkpoint.
@@ -157,6 +199,7 @@ impl Trainings {
                 steps: order.steps,
                 losses: String::new(),
                 left: String::new(),
+                validation: Vec::new(),
                 reason: String::new(),
                 comparison: None,
             };
@@ -211,8 +254,13 @@ impl Trainings {
             .arg("--problems")
             .args(&order.problems)
             .arg("--demos")
-            .args(&order.learn);
+            .args(&order.learn)
+            .arg("--held-out")
+            .args(&order.held_out);
         self.run(train, |line| {
+            if let Some(validation) = validation(line) {
+                self.change(|state| state.validation.push(validation));
+            }
             if let Some((step, losses, left)) = progress(line) {
                 self.change(|state| {
                     state.step = step;
@@ -235,7 +283,8 @@ impl Trainings {
             .arg(&start_from);
         compare.arg("--demos").args(&order.held_out);
         let report = self.run(compare, |_| ()).await?;
-        let comparison = comparison(&report)?;
+        let (comparison, examples) = comparison(&report)?;
+        *self.examples.lock().unwrap_or_else(PoisonError::into_inner) = examples;
         let checkpoint = self.folder.join(&order.name).with_extension("safetensors");
         std::fs::copy(&policy, &checkpoint)?;
         self.change(|state| state.comparison = Some(comparison));
@@ -303,24 +352,66 @@ fn progress(line: &str) -> Option<(u64, &str, &str)> {
     Some((step.parse().ok()?, losses, left.strip_suffix(" left")?))
 }
 
-/// The comparison that `sctn compare --json` prints last: of the new policy, and of the one of now.
-fn comparison(report: &str) -> anyhow::Result<Comparison> {
+/// The snapshot that a line of `sctn train` compares with the held-out steps.
+fn validation(line: &str) -> Option<Validation> {
+    let (_, rest) = line.split_once("step ")?;
+    let (step, rest) = rest.split_once(": held out: pick ")?;
+    let (pick_mm, rest) = rest.split_once(" mm, place ")?;
+    let (place_mm, rest) = rest.split_once(" mm, turn ")?;
+    let (turn_deg, _) = rest.split_once(" degrees")?;
+    let number = |text: &str| text.parse::<f64>().ok();
+    Some(Validation {
+        step: step.parse().ok()?,
+        distance: Distance {
+            pick_m: 1e-3 * number(pick_mm)?,
+            place_m: 1e-3 * number(place_mm)?,
+            turn_rad: number(turn_deg)?.to_radians(),
+        },
+    })
+}
+
+/// What `sctn compare --json` prints last.
+#[derive(Deserialize)]
+struct Report {
+    /// Of the new policy, and of the one of now.
+    median: [Distance; 2],
+    steps: Vec<ReportedStep>,
+}
+
+#[derive(Deserialize)]
+struct ReportedStep {
+    demonstration: PathBuf,
+    step: usize,
+    shown: Action,
+    proposed: [Action; 2],
+}
+
+/// The comparison that `sctn compare --json` prints last, and the first of its steps.
+fn comparison(report: &str) -> anyhow::Result<(Comparison, Vec<Example>)> {
     use anyhow::Context as _;
     let line = report
         .lines()
         .last()
         .context("sctn compare has said nothing")?;
-    let report: Value = serde_json::from_str(line).context("the report of sctn compare")?;
-    let distance = |index: usize| -> anyhow::Result<Distance> {
-        let value = report["median"][index].clone();
-        serde_json::from_value(value)
-            .with_context(|| format!("the report of sctn compare: median[{index}]"))
+    let report: Report = serde_json::from_str(line).context("the report of sctn compare")?;
+    let [new, now] = report.median;
+    let comparison = Comparison {
+        steps: report.steps.len(),
+        new,
+        now,
     };
-    Ok(Comparison {
-        steps: report["steps"].as_array().map_or(0, Vec::len),
-        new: distance(0)?,
-        now: distance(1)?,
-    })
+    let examples = report.steps.into_iter().take(EXAMPLES).map(|step| {
+        let name = step.demonstration.file_name().unwrap_or_default();
+        let [new, now] = step.proposed;
+        Example {
+            demonstration: name.to_string_lossy().into_owned(),
+            step: step.step,
+            shown: step.shown,
+            new,
+            now,
+        }
+    });
+    Ok((comparison, examples.collect()))
 }
 
 #[cfg(test)]
@@ -341,6 +432,7 @@ pub(crate) mod tests {
             steps: 20,
             losses: "pick loss 0.1".into(),
             left: "1 second".into(),
+            validation: vec![Validation { step: 20, distance }],
             reason: String::new(),
             comparison: Some(Comparison {
                 steps: 2,
@@ -357,13 +449,15 @@ pub(crate) mod tests {
     const TRAIN: &str = r#"#!/bin/sh
 if [ "$1" = train ]; then
   echo "INFO step 10: pick loss 1.250, place loss 0.500, 3 seconds left" >&2
+  echo "INFO step 20: held out: pick 12.5 mm, place 40.0 mm, turn 0.0 degrees from 2 steps (median)" >&2
   while [ "$1" != --out ]; do shift; done
   mkdir -p "$2"; echo weights > "$2/policy.safetensors"
   [ "$FAIL" = 1 ] && { echo "no memory" >&2; exit 1; }
   [ -e "$2/../wait" ] && sleep 60
   exit 0
 fi
-echo '{"median": [{"pick_m": 0.01, "place_m": 0.02, "turn_rad": 0.1}, {"pick_m": 0.03, "place_m": 0.04, "turn_rad": 0.2}], "steps": [{}, {}]}'
+echo '{"median": [{"pick_m": 0.01, "place_m": 0.02, "turn_rad": 0.1}, {"pick_m": 0.03, "place_m": 0.04, "turn_rad": 0.2}], "steps": [{"demonstration": "library/b", "step": 1, "shown": @, "proposed": [@, @], "distances": []}]}' | \
+  sed 's/@/{"pick": {"x_m": 0.5, "y_m": 0, "yaw_rad": 0}, "place": {"x_m": 0.6, "y_m": 0, "yaw_rad": 0}}/g'
 "#;
 
     fn made(folder: &Path, script: &str) -> (Arc<Trainings>, Order) {
@@ -416,8 +510,17 @@ echo '{"median": [{"pick_m": 0.01, "place_m": 0.02, "turn_rad": 0.1}, {"pick_m":
                 comparison.new.pick_m,
                 comparison.now.pick_m
             ),
-            (2, 0.01, 0.03)
+            (1, 0.01, 0.03)
         );
+        let [validation] = &state.validation[..] else {
+            panic!("{:?}", state.validation);
+        };
+        assert_eq!((validation.step, validation.distance.pick_m), (20, 0.0125));
+        let [example] = &trainings.examples()[..] else {
+            panic!("{:?}", trainings.examples());
+        };
+        assert_eq!((example.demonstration.as_str(), example.step), ("b", 1));
+        assert_eq!(example.now.place.x_m, 0.6);
         assert!(folder.path().join("training/taught.safetensors").is_file());
 
         let (failing, order) = made(folder.path(), &TRAIN.replace("\"$FAIL\"", "1"));

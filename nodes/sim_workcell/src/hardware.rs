@@ -14,7 +14,7 @@ use driver_model::{AcceptanceQueue, Answer, EncoderNoise, Fault, HardwareSetting
 use msgs::rosgraph_msgs::Clock;
 use msgs::sctn_msgs::{ResetCellRequest, ResetCellResponse, Reward};
 use msgs::sensor_msgs::JointState;
-use msgs::std_msgs::{self, Bool};
+use msgs::std_msgs::{self, Bool, Float64};
 use msgs::tf2_msgs::TFMessage;
 use msgs::ur_dashboard_msgs::{RobotMode, SafetyMode};
 use msgs::ur_msgs::{FollowJointTrajectoryUntil, IOStates, SetIORequest, ToolDataMsg};
@@ -75,6 +75,8 @@ pub(crate) struct Hardware {
     safety_mode: Publisher<SafetyMode>,
     program_running: Publisher<Bool>,
     tool_data: Publisher<ToolDataMsg>,
+    /// Percent.
+    speed_scaling: Publisher<Float64>,
     /// What the cameras saw at this rest: one set of frames of perfect cameras, several of noisy ones.
     frames: Vec<Vec<(usize, Frame)>>,
     /// Which set is said next.
@@ -153,6 +155,8 @@ impl Hardware {
             safety_mode: node.publisher(&status("safety_mode"), Qos::Latched)?,
             program_running: node.publisher(&status("robot_program_running"), Qos::Latched)?,
             tool_data: node.publisher(&status("tool_data"), Qos::Event)?,
+            speed_scaling: node
+                .publisher("speed_scaling_state_broadcaster/speed_scaling", Qos::Event)?,
             unanswered: AcceptanceQueue::new(range.0, range.1, seed),
             next: None,
             orphans: Vec::new(),

@@ -17,8 +17,6 @@ const PLANNED_WITHIN: Duration = Duration::from_secs(5);
 /// A motion of the lesson that the executor has not planned yet.
 pub(super) struct Planning {
     proposal_id: u64,
-    /// Who has asked for it.
-    viewer: ViewerId,
     since: Duration,
 }
 
@@ -55,7 +53,8 @@ impl State {
             .ok_or_else(|| Refusal::new("No lesson is being given.", "Begin a lesson first."))
     }
 
-    /// The operator shows a step: it is proposed, approved as soon as the executor has planned it, and passes the executor's checks as every proposal does.
+    /// The operator shows a step: it is proposed, and its planned motion is shown. Nothing moves before
+    /// [`Self::execute_step`].
     ///
     /// # Errors
     /// When somebody else decides, the last motion is not judged, something is stale, or a pose lies outside the workspace.
@@ -70,7 +69,7 @@ impl State {
         self.move_in_lesson(viewer, pick, place, settings, false, now)
     }
 
-    /// The operator takes the last step of the lesson back: the arm moves the object back.
+    /// The operator takes the last step of the lesson back: the arm is to move the object back.
     ///
     /// # Errors
     /// As [`Self::show_step`], and when there is no step.
@@ -102,13 +101,51 @@ impl State {
         let _ = self.run.on_proposal(proposal);
         self.planning = Some(Planning {
             proposal_id: id,
-            viewer,
             since: now,
         });
         Ok(())
     }
 
-    /// The executor has planned a motion. That of the lesson is approved; where it cannot be planned, the lesson goes on without.
+    /// A new proposal of somebody else's, for instance of the policy, has superseded the motion of the lesson that waits for its
+    /// approval: it is proposed again.
+    pub(super) fn propose_again(&mut self, now: Duration) {
+        let Some(pending) = self.lesson.as_ref().and_then(Lesson::pending) else {
+            return;
+        };
+        let [pick, place] = [&pending.pick, &pending.place].map(Pose::from_msg);
+        let (settings, author) = (pending.settings, pending.author.clone());
+        let Some(number) = self.lesson.as_ref().and_then(Lesson::next_renewal) else {
+            let refusal = Refusal::new(
+                "Other proposals take the place of the lesson's again and again: nothing has moved.",
+                "Look which program proposes too, then show the step again.",
+            );
+            return self.forget_trial(refusal, now);
+        };
+        let again = self
+            .run
+            .lesson_step(pick, place, settings, number, &author, now);
+        let sent = again.and_then(|(proposal, view)| {
+            let view = view.clone();
+            self.send(Command::Propose(Box::new(proposal.clone())))?;
+            Ok((proposal, view))
+        });
+        match sent {
+            Ok((proposal, view)) => {
+                self.planning = Some(Planning {
+                    proposal_id: proposal.id,
+                    since: now,
+                });
+                if let Some(lesson) = &mut self.lesson {
+                    lesson.renew(proposal.clone(), &view);
+                }
+                // Its poses and settings were checked.
+                let _ = self.run.on_proposal(proposal);
+            }
+            Err(refusal) => self.forget_trial(refusal, now),
+        }
+    }
+
+    /// The executor has planned a motion. That of the lesson is shown; where it cannot be planned, the lesson goes on without.
     ///
     /// # Errors
     /// Names the field that makes no sense.
@@ -119,42 +156,63 @@ impl State {
     ) -> Result<(), InvalidMessage> {
         let (id, reason) = (message.proposal_id, message.reason.clone());
         self.run.on_planned_motion(message)?;
-        let Some(Planning { viewer, .. }) = self.planning.take_if(|asked| asked.proposal_id == id)
-        else {
+        let asked = self.planning.take_if(|asked| asked.proposal_id == id);
+        if asked.is_none() {
             return Ok(());
-        };
-        let refusal = if !reason.is_empty() {
-            Refusal::new(
+        }
+        if reason.is_empty() {
+            if let Some(lesson) = &mut self.lesson {
+                lesson.planned();
+            }
+        } else {
+            let refusal = Refusal::new(
                 format!("The motion cannot be planned: {reason}."),
                 advice(&reason),
-            )
-        } else if let Err(refusal) = self.sessions.check_operator(viewer) {
-            refusal
-        } else {
-            let approval = StepConfirmation {
-                proposal_id: id,
-                decision: Decision::Approve.to_msg(),
-                operator_name: self.sessions.name(viewer).to_owned(),
-                ..StepConfirmation::default()
-            };
-            match self.confirm(approval, now) {
-                Ok(()) => {
-                    if let Some(lesson) = &mut self.lesson {
-                        lesson.approve();
-                    }
-                    return Ok(());
-                }
-                Err(refusal) => refusal,
-            }
-        };
-        self.forget_trial(refusal, now);
+            );
+            self.forget_trial(refusal, now);
+        }
         Ok(())
     }
 
-    /// Nothing is approved any more by itself.
-    pub(super) fn drop_planning(&mut self) {
-        if self.planning.take().is_some()
+    /// The operator has the motion carried out whose plan is shown. It passes the executor's checks as every proposal does.
+    ///
+    /// # Errors
+    /// When somebody else decides, no planned motion waits, or something is stale.
+    pub fn execute_step(&mut self, viewer: ViewerId, now: Duration) -> Result<(), Refusal> {
+        self.lesson(viewer)?;
+        if let Some(refusal) = self.run.obstacle(now) {
+            return Err(refusal);
+        }
+        let approval = StepConfirmation {
+            proposal_id: self.lesson(viewer)?.execute()?,
+            decision: Decision::Approve.to_msg(),
+            operator_name: self.sessions.name(viewer).to_owned(),
+            ..StepConfirmation::default()
+        };
+        let sent = self.confirm(approval, now);
+        if sent.is_err()
             && let Some(lesson) = &mut self.lesson
+        {
+            lesson.forget();
+        }
+        sent
+    }
+
+    /// The operator does not have the motion carried out whose plan is shown, and chooses pick and place anew.
+    ///
+    /// # Errors
+    /// When somebody else decides, or no motion waits for its approval.
+    pub fn change_step(&mut self, viewer: ViewerId) -> Result<(), Refusal> {
+        self.lesson(viewer)?.change()?;
+        self.planning = None;
+        Ok(())
+    }
+
+    /// Nothing waits for an approval any more.
+    pub(super) fn drop_planning(&mut self) {
+        self.planning = None;
+        if let Some(lesson) = &mut self.lesson
+            && lesson.pending().is_some()
         {
             lesson.forget();
         }
@@ -168,13 +226,14 @@ impl State {
         }
         let refusal = Refusal::new(
             "The executor has not planned the motion: nothing has moved.",
-            "Look whether suction_executor is active, then carry it out again.",
+            "Look whether suction_executor is active, then show the step again.",
         );
         self.forget_trial(refusal, now);
         true
     }
 
     fn forget_trial(&mut self, refusal: Refusal, now: Duration) {
+        self.planning = None;
         if let Some(lesson) = &mut self.lesson {
             lesson.forget();
         }
@@ -204,6 +263,7 @@ impl State {
 
     /// The lesson is on disk.
     pub fn lesson_saved(&mut self) {
+        self.library_version += 1;
         if let Some(lesson) = &mut self.lesson {
             lesson.saved();
         }

@@ -30,13 +30,6 @@ fn proposed() -> (Console, ViewerId, mpsc::UnboundedReceiver<Command>) {
         state.sessions.take(ada, None).unwrap();
         state.run.on_joints(Vec::new(), Vec::new(), now);
         state.on_heightmap(heightmap(), now).unwrap();
-        let goal = Goal {
-            step: 1,
-            step_count: 1,
-            heightmap: heightmap(),
-            ..Goal::default()
-        };
-        state.run.on_goal(goal, now).unwrap();
         let settings = PrimitiveSettings {
             clearance_m: 0.1,
             lift_m: 0.1,
@@ -45,6 +38,14 @@ fn proposed() -> (Console, ViewerId, mpsc::UnboundedReceiver<Command>) {
             descend_m_s: 0.1,
             acceleration_m_s2: 1.0,
         };
+        let goal = Goal {
+            step: 1,
+            step_count: 1,
+            heightmap: heightmap(),
+            settings,
+            ..Goal::default()
+        };
+        state.run.on_goal(goal, now).unwrap();
         let proposal = PickPlace {
             id: 7,
             step: 1,
@@ -100,6 +101,10 @@ pub(crate) fn with_everything() -> Console {
             previous: "old.safetensors".into(),
         });
         state.begin_lesson(ada).unwrap();
+        state.on_home(9, true);
+        let planned = crate::preview::tests::planned(9);
+        state.on_planned_motion(planned, now).unwrap();
+        state.lesson_saved();
     });
     drop(commands);
     console
@@ -244,12 +249,18 @@ fn a_lesson_is_shown_judged_taken_back_and_becomes_a_demonstration() {
         let Ok(Command::Propose(proposal)) = commands.try_recv() else {
             panic!("expected a proposal");
         };
-        // Nothing is approved before the executor knows the proposal.
-        assert!(commands.try_recv().is_err());
+        let execute = || console.change(|state, now| state.execute_step(ada, now));
+        // Nothing can be carried out before the executor has planned it.
+        execute().unwrap_err();
         console.change(|state, now| {
             let planned = crate::preview::tests::planned(proposal.id);
             state.on_planned_motion(planned, now).unwrap();
+            assert_eq!(state.pending_motion().unwrap().proposal_id, proposal.id);
         });
+        // It is shown, and moves when the person says so.
+        assert!(commands.try_recv().is_err());
+        execute().unwrap();
+        execute().unwrap_err();
         let Ok(Command::Confirm(approval)) = commands.try_recv() else {
             panic!("expected its approval");
         };
@@ -318,6 +329,7 @@ fn a_lesson_is_shown_judged_taken_back_and_becomes_a_demonstration() {
         (listed[0].name.as_str(), listed[0].step_count),
         ("three_blocks", 1)
     );
+    assert!(listed[0].runs.is_empty());
     assert_eq!(library.picture("three_blocks", 1).unwrap().height_m, [1.0]);
     assert!(library.picture("three_blocks", 2).is_err());
     assert!(library.picture("../three_blocks", 0).is_err());
@@ -368,4 +380,283 @@ fn a_motion_of_a_lesson_that_cannot_be_planned_is_not_approved_and_the_lesson_go
         .unwrap();
     shown(0.4);
     assert!(commands.try_recv().is_err());
+}
+
+#[test]
+fn a_shown_step_is_changed_stopped_and_proposed_again_when_another_proposal_supersedes_it() {
+    let (console, ada, mut commands) = proposed();
+    let pose = |x_m| Pose {
+        x_m,
+        y_m: 0.5,
+        yaw_rad: 0.0,
+    };
+    let settings = convert::settings_to_msg(&pick_place::PrimitiveSettings::RIGID);
+    let show = |x_m| {
+        console
+            .change(|state, now| state.show_step(ada, pose(x_m), pose(0.8), settings, now))
+            .unwrap();
+    };
+    let mut proposed = || match commands.try_recv() {
+        Ok(Command::Propose(proposal)) => proposal,
+        other => panic!("expected a proposal: {other:?}"),
+    };
+    let plan = |id| {
+        let planned = crate::preview::tests::planned(id);
+        console
+            .change(|state, now| state.on_planned_motion(planned, now))
+            .unwrap();
+    };
+    let phase = || {
+        let json: serde_json::Value =
+            serde_json::from_str(&console.snapshot(None).unwrap()).unwrap();
+        json["lesson"]["phase"].as_str().unwrap().to_owned()
+    };
+    console.change(|state, _| state.begin_lesson(ada)).unwrap();
+    show(0.2);
+    plan(proposed().id);
+    assert_eq!(phase(), "previewing");
+    console.change(|state, _| state.change_step(ada)).unwrap();
+    assert_eq!(phase(), "choosing");
+    console
+        .change(|state, _| state.change_step(ada))
+        .unwrap_err();
+    // A stop leaves nothing that could be carried out.
+    show(0.3);
+    plan(proposed().id);
+    decide(&console, ada, 0, Decision::Stop).unwrap();
+    assert_eq!(phase(), "choosing");
+    console
+        .change(|state, now| state.execute_step(ada, now))
+        .unwrap_err();
+    assert!(matches!(commands.try_recv(), Ok(Command::Confirm(_))));
+    let mut proposed = || match commands.try_recv() {
+        Ok(Command::Propose(proposal)) => proposal,
+        other => panic!("expected a proposal: {other:?}"),
+    };
+    // The policy proposes meanwhile.
+    show(0.4);
+    let first = proposed();
+    plan(first.id);
+    let policys = |id| PickPlace {
+        id,
+        step: 1,
+        settings,
+        ..PickPlace::default()
+    };
+    console
+        .change(|state, now| state.on_proposal(policys(8), now))
+        .unwrap();
+    assert_eq!(phase(), "planning");
+    let again = proposed();
+    assert_ne!(again.id, first.id);
+    assert_eq!((again.pick, again.place), (first.pick, first.place));
+    // Our own comes back, and the policy's once more: nothing new.
+    for message in [*again.clone(), policys(8)] {
+        console
+            .change(|state, now| state.on_proposal(message, now))
+            .unwrap();
+    }
+    plan(again.id);
+    console
+        .change(|state, now| state.execute_step(ada, now))
+        .unwrap();
+    let Ok(Command::Confirm(approval)) = commands.try_recv() else {
+        panic!("expected an approval");
+    };
+    assert_eq!(approval.proposal_id, again.id);
+}
+
+#[test]
+fn the_way_home_is_shown_and_moves_only_when_the_operator_approves_it() {
+    let (console, ada, mut commands) = proposed();
+    console.change(|state, _| state.home(ada)).unwrap();
+    assert_eq!(commands.try_recv().unwrap(), Command::Home("Ada".into()));
+    console.change(|state, _| state.on_home(9, true));
+    let refusal = decide(&console, ada, 9, Decision::Approve).unwrap_err();
+    assert!(refusal.reason.contains("not been shown"), "{refusal:?}");
+    let plan = || {
+        let planned = crate::preview::tests::planned(9);
+        console
+            .change(|state, now| state.on_planned_motion(planned, now))
+            .unwrap();
+    };
+    plan();
+    let pending =
+        || console.read(|state, _| state.pending_motion().map(|motion| motion.proposal_id));
+    assert_eq!(pending(), Some(9));
+    let bob = console.change(|state, now| state.sessions.join("Bob", "b".into(), now).unwrap());
+    decide(&console, bob, 9, Decision::Approve).unwrap_err();
+    // Left: nothing is sent, and the proposal of the run is shown again.
+    decide(&console, ada, 9, Decision::Reject).unwrap();
+    assert_eq!(pending(), Some(7));
+    decide(&console, ada, 9, Decision::Approve).unwrap_err();
+    assert!(commands.try_recv().is_err());
+    console.change(|state, _| state.on_home(9, true));
+    decide(&console, ada, 9, Decision::Approve).unwrap();
+    let Ok(Command::Confirm(approval)) = commands.try_recv() else {
+        panic!("expected an approval");
+    };
+    let expected = (9, StepConfirmation::APPROVE);
+    assert_eq!((approval.proposal_id, approval.decision), expected);
+    assert_eq!(approval.operator_name, "Ada");
+    let home = || console.read(|state, _| state.home);
+    assert!(home().unwrap().approved);
+    let at_home = StepResult {
+        proposal_id: 9,
+        outcome: StepResult::AT_HOME,
+        ..StepResult::default()
+    };
+    console
+        .change(|state, now| state.on_result(&at_home, now))
+        .unwrap();
+    assert_eq!(home(), None);
+    // A stop withdraws it.
+    console.change(|state, _| state.on_home(10, true));
+    decide(&console, bob, 0, Decision::Stop).unwrap();
+    assert_eq!(home(), None);
+}
+
+/// The motion of proposal 7 ends, and what it has led to is in view.
+fn finish(console: &Console, outcome: u8) {
+    let mut result = StepResult {
+        proposal_id: 7,
+        outcome,
+        ..StepResult::default()
+    };
+    result.header.stamp.sec = 1;
+    result.duration.sec = 1;
+    let mut after = heightmap();
+    after.header.stamp.sec = 2;
+    console.change(|state, now| {
+        state.on_result(&result, now).unwrap();
+        state.on_heightmap(after, now).unwrap();
+    });
+}
+
+#[test]
+fn a_run_of_a_taught_task_is_counted_with_its_checkpoint_when_the_policy_has_moved_something() {
+    let (console, ada, mut commands) = proposed();
+    let goal = |step, complete| Goal {
+        step,
+        step_count: 1,
+        demonstration: "blocks/0".into(),
+        complete,
+        heightmap: heightmap(),
+        ..Goal::default()
+    };
+    let on_goal = |goal| {
+        console
+            .change(|state, now| state.on_goal(goal, now))
+            .unwrap()
+    };
+    console.change(|state, _| state.on_loaded("blocks".into(), "blocks/0".into()));
+    on_goal(goal(1, false));
+    let proposal = PickPlace {
+        id: 7,
+        step: 1,
+        checkpoint: "any_start".into(),
+        settings: convert::settings_to_msg(&pick_place::PrimitiveSettings::RIGID),
+        ..PickPlace::default()
+    };
+    // The one of before has no checkpoint.
+    console.change(|state, now| {
+        state.run = Run::new(Watch {
+            nodes: Vec::new(),
+            executor: "/suction_executor".into(),
+            stale_after: Duration::from_secs(3),
+            changes: heightmap::ChangeRules::default(),
+        });
+        state.run.on_joints(Vec::new(), Vec::new(), now);
+        state.on_heightmap(heightmap(), now).unwrap();
+        state.on_goal(goal(1, false), now).unwrap();
+        state.on_proposal(proposal, now).unwrap();
+        state
+            .on_planned_motion(crate::preview::tests::planned(7), now)
+            .unwrap();
+    });
+    decide(&console, ada, 7, Decision::Approve).unwrap();
+    assert!(matches!(commands.try_recv(), Ok(Command::Confirm(_))));
+    finish(&console, StepResult::PLACED);
+    let began = RunEvent::Began {
+        run: 7,
+        demonstration: "blocks".into(),
+        goals: "blocks/0".into(),
+        checkpoint: "any_start".into(),
+    };
+    assert_eq!(commands.try_recv().unwrap(), Command::Record(began.clone()));
+    on_goal(goal(1, true));
+    let completed = Command::Record(RunEvent::Completed { run: 7 });
+    assert_eq!(commands.try_recv().unwrap(), completed);
+    // A run that another console has begun is completed; one that another demonstration ended is not.
+    console.change(|state, _| state.resume_run(began.clone()));
+    on_goal(goal(1, false));
+    on_goal(goal(1, true));
+    assert_eq!(commands.try_recv().unwrap(), completed);
+    console.change(|state, _| state.resume_run(began));
+    let other = Goal {
+        demonstration: "other/0".into(),
+        ..goal(1, false)
+    };
+    on_goal(other);
+    on_goal(goal(1, true));
+    assert!(commands.try_recv().is_err());
+}
+
+#[test]
+fn a_correction_that_the_operator_confirms_is_kept_once_as_a_demonstration_of_one_step() {
+    let (console, ada, mut commands) = proposed();
+    let pose = |x_m| Pose {
+        x_m,
+        y_m: 0.5,
+        yaw_rad: 0.0,
+    };
+    let id = console
+        .change(|state, _| state.correct(ada, pose(0.2), pose(0.8)))
+        .unwrap();
+    assert!(matches!(commands.try_recv(), Ok(Command::Propose(_))));
+    console
+        .change(|state, now| state.on_planned_motion(crate::preview::tests::planned(id), now))
+        .unwrap();
+    decide(&console, ada, id, Decision::Approve).unwrap();
+    assert!(matches!(commands.try_recv(), Ok(Command::Confirm(_))));
+    let mut result = StepResult {
+        proposal_id: id,
+        outcome: StepResult::PLACED,
+        ..StepResult::default()
+    };
+    result.header.stamp.sec = 1;
+    result.duration.sec = 1;
+    console
+        .change(|state, now| state.on_result(&result, now))
+        .unwrap();
+    decide(&console, ada, id, Decision::Advance).unwrap();
+    assert!(matches!(commands.try_recv(), Ok(Command::Confirm(_))));
+    // What it has led to is not in view yet.
+    assert!(commands.try_recv().is_err());
+    let mut after = heightmap();
+    after.header.stamp.sec = 2;
+    after.height_m = vec![0.5];
+    console
+        .change(|state, now| state.on_heightmap(after.clone(), now))
+        .unwrap();
+    let Ok(Command::Keep(correction)) = commands.try_recv() else {
+        panic!("expected a correction");
+    };
+    let (name, demonstration) = *correction;
+    assert_eq!(name, format!("-1-{id:016x}"));
+    assert_eq!(demonstration.problem, name);
+    assert_eq!(demonstration.steps.len(), 1);
+    assert_eq!(demonstration.steps[0].action.place.translation.x, 0.8);
+    assert_eq!(demonstration.last.height_m, [0.5]);
+    console
+        .change(|state, now| state.on_heightmap(after, now))
+        .unwrap();
+    assert!(commands.try_recv().is_err());
+    let folder = tempfile::tempdir().unwrap();
+    let libraries = crate::library::Libraries::new(folder.path());
+    libraries.corrections.save(&name, &demonstration).unwrap();
+    assert_eq!(libraries.tasks(), []);
+    assert_eq!(libraries.corrections.list()[0].name, name);
+    let picture = libraries.holding(&name).picture(&name, 1).unwrap();
+    assert_eq!(picture.height_m, [0.5]);
 }

@@ -158,7 +158,7 @@ impl Run {
     }
 
     /// Why nothing can be approved: something is stale, or the robot is not ready.
-    pub(super) fn obstacle(&self, now: Duration) -> Option<Refusal> {
+    pub(crate) fn obstacle(&self, now: Duration) -> Option<Refusal> {
         let executor = self.watch.executor.trim_start_matches('/');
         for stream in self.streams(now) {
             if stream.required && stream.stale {

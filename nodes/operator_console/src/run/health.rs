@@ -30,6 +30,8 @@ pub struct Robot {
     pub safety_mode: Option<u8>,
     /// Whether the robot program runs.
     pub program_running: Option<bool>,
+    /// Share of the planned speed that the arm moves with.
+    pub speed_scaling: Option<f64>,
     /// Whether suction is on.
     pub suction: Option<bool>,
     /// Whether the vacuum sensor feels an object.

@@ -154,6 +154,7 @@ impl Run {
             decided_by: String::new(),
             before,
             after: self.views.iter().find(|view| view.stamp >= ended).cloned(),
+            is_kept: false,
         });
         Ok(())
     }

@@ -27,6 +27,14 @@ pub struct Pose {
 }
 
 impl Pose {
+    pub(crate) fn from_msg(pose: &Pose2D) -> Self {
+        Self {
+            x_m: pose.x,
+            y_m: pose.y,
+            yaw_rad: pose.theta,
+        }
+    }
+
     fn to_msg(self) -> Pose2D {
         Pose2D {
             x: self.x_m,

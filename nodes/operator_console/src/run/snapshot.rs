@@ -3,12 +3,12 @@
 use std::collections::{BTreeMap, VecDeque};
 use std::time::Duration;
 
-use msgs::geometry_msgs::Pose2D;
 use msgs::sctn_msgs::{Heightmap, PickPlace};
 use serde::Serialize;
 
 use super::health::{NodeState, Robot, Stream, worst};
 use super::{Decision, Notice, PastStep, Phase, Pose, Run, View, duration, outcome_words};
+use crate::preview::Motion;
 use crate::refusal::Refusal;
 
 /// The run, as JSON for the page: docs/operator_console.openapi.yaml explains each field.
@@ -31,17 +31,27 @@ pub struct Snapshot<'a> {
     robot: &'a Robot,
     joints: Option<BTreeMap<&'a str, f64>>,
     reward: Option<f64>,
-    motion: Option<MotionState<'a>>,
     scores: Option<u64>,
     robot_description: bool,
 }
 
-/// The planned motion of the present proposal.
+/// A planned motion that waits for an approval.
 #[derive(Debug, Serialize)]
-struct MotionState<'a> {
+pub struct MotionState<'a> {
+    proposal_id: String,
     duration_s: f64,
     /// Why it cannot be planned; empty where it can be.
     reason: &'a str,
+}
+
+impl<'a> From<&'a Motion> for MotionState<'a> {
+    fn from(motion: &'a Motion) -> Self {
+        Self {
+            proposal_id: motion.proposal_id.to_string(),
+            duration_s: motion.duration_s(),
+            reason: &motion.reason,
+        }
+    }
 }
 
 /// Where a heightmap lies.
@@ -118,18 +128,13 @@ pub struct ProposalState<'a> {
 
 impl<'a> ProposalState<'a> {
     fn of(message: &'a PickPlace) -> Self {
-        let pose = |pose: &Pose2D| Pose {
-            x_m: pose.x,
-            y_m: pose.y,
-            yaw_rad: pose.theta,
-        };
         Self {
             id: message.id.to_string(),
             step: message.step,
             attempt: message.attempt,
             module: &message.module,
-            pick: pose(&message.pick),
-            place: pose(&message.place),
+            pick: Pose::from_msg(&message.pick),
+            place: Pose::from_msg(&message.place),
             pick_score: message.pick_score,
             place_score: message.place_score,
             success_probability: Some(message.success_probability)
@@ -221,10 +226,6 @@ impl Run {
                     .collect()
             }),
             reward: self.reward.as_ref().map(|reward| reward.total),
-            motion: self.motion().map(|motion| MotionState {
-                duration_s: motion.duration_s(),
-                reason: &motion.reason,
-            }),
             scores: self.scores().map(|scores| scores.number),
             robot_description: self.robot_description.is_some(),
         }

@@ -1,9 +1,10 @@
 //! Who may ask, and what an answer is that is none.
 
 use std::net::SocketAddr;
+use std::time::Duration;
 
 use axum::extract::rejection::JsonRejection;
-use axum::extract::{FromRequestParts, Json, Request, State};
+use axum::extract::{self, FromRequest, FromRequestParts, Json, Request};
 use axum::http::header::{
     AUTHORIZATION, CACHE_CONTROL, CONTENT_SECURITY_POLICY, HOST, ORIGIN, REFERRER_POLICY,
     X_CONTENT_TYPE_OPTIONS,
@@ -12,9 +13,11 @@ use axum::http::request::Parts;
 use axum::http::{HeaderMap, HeaderName, HeaderValue, StatusCode};
 use axum::middleware::Next;
 use axum::response::{IntoResponse, Response};
+use serde::de::DeserializeOwned;
 use subtle::ConstantTimeEq as _;
 
 use super::Shared;
+use crate::console::State;
 use crate::refusal::Refusal;
 use crate::session::ViewerId;
 
@@ -149,7 +152,11 @@ impl IntoResponse for Failure {
 }
 
 /// Every request: the right host and origin; every answer: what a browser may do with it.
-pub(super) async fn guard(State(shared): State<Shared>, request: Request, next: Next) -> Response {
+pub(super) async fn guard(
+    extract::State(shared): extract::State<Shared>,
+    request: Request,
+    next: Next,
+) -> Response {
     let mut response = match shared.access.check_origin(request.headers()) {
         Ok(()) => next.run(request).await,
         Err(failure) => failure.into_response(),
@@ -179,7 +186,7 @@ pub(super) async fn guard(State(shared): State<Shared>, request: Request, next: 
 }
 
 pub(super) async fn require_token(
-    State(shared): State<Shared>,
+    extract::State(shared): extract::State<Shared>,
     request: Request,
     next: Next,
 ) -> Result<Response, Failure> {
@@ -195,10 +202,46 @@ pub(super) async fn not_found() -> Failure {
     )
 }
 
-/// The viewer that asks, by its key.
-pub(super) struct Viewer(pub(super) ViewerId);
+/// What most requests are answered with: nothing but a status.
+pub(super) type Answer = Result<StatusCode, Failure>;
 
-impl FromRequestParts<Shared> for Viewer {
+/// The viewer that asks, by its key, and what handlers share.
+pub(super) struct By {
+    pub(super) viewer: ViewerId,
+    pub(super) shared: Shared,
+}
+
+impl By {
+    /// Changes the state; other viewers are told.
+    pub(super) fn change(
+        &self,
+        done: StatusCode,
+        change: impl FnOnce(&mut State, Duration) -> Result<(), Refusal>,
+    ) -> Answer {
+        self.shared.console.change(change)?;
+        Ok(done)
+    }
+
+    /// Checks that the viewer decides.
+    pub(super) fn check_operator(&self) -> Result<(), Refusal> {
+        let check = |state: &State, _| state.sessions.check_operator(self.viewer);
+        self.shared.console.read(check)
+    }
+}
+
+/// The body of a request, as JSON.
+pub(super) struct Body<T>(pub(super) T);
+
+impl<T: DeserializeOwned> FromRequest<Shared> for Body<T> {
+    type Rejection = Failure;
+
+    async fn from_request(request: Request, shared: &Shared) -> Result<Self, Failure> {
+        let Json(body) = Json::from_request(request, shared).await?;
+        Ok(Self(body))
+    }
+}
+
+impl FromRequestParts<Shared> for By {
     type Rejection = Failure;
 
     async fn from_request_parts(parts: &mut Parts, shared: &Shared) -> Result<Self, Failure> {
@@ -211,7 +254,9 @@ impl FromRequestParts<Shared> for Viewer {
             state.sessions.heard(id, true, now);
             Some(id)
         });
-        found.map(Self).ok_or_else(|| {
+        let shared = shared.clone();
+        let by = |viewer| Self { viewer, shared };
+        found.map(by).ok_or_else(|| {
             Failure::new(
                 StatusCode::UNAUTHORIZED,
                 "Your session is over.",

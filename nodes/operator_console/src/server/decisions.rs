@@ -1,6 +1,5 @@
 //! The state of the run, and what the operator decides.
 
-use axum::extract::rejection::JsonRejection;
 use axum::extract::{Json, State};
 use axum::http::StatusCode;
 use axum::http::header::CONTENT_TYPE;
@@ -8,7 +7,7 @@ use axum::response::{IntoResponse, Response};
 use serde::{Deserialize, Serialize};
 
 use super::Shared;
-use super::access::{Failure, Viewer};
+use super::access::{Answer, Body, By, Failure};
 use crate::run::{Decision, Pose};
 
 pub(super) async fn state(State(shared): State<Shared>) -> Result<Response, Failure> {
@@ -32,26 +31,17 @@ pub(super) struct Decide {
     decision: Decision,
 }
 
-pub(super) async fn decide(
-    State(shared): State<Shared>,
-    Viewer(viewer): Viewer,
-    body: Result<Json<Decide>, JsonRejection>,
-) -> Result<StatusCode, Failure> {
-    let Json(Decide {
-        proposal_id,
-        decision,
-    }) = body?;
-    let id: u64 = proposal_id.parse().map_err(|_| {
+pub(super) async fn decide(by: By, Body(asked): Body<Decide>) -> Answer {
+    let id: u64 = asked.proposal_id.parse().map_err(|_| {
         Failure::new(
             StatusCode::UNPROCESSABLE_ENTITY,
             "proposal_id: expected a number of 64 bits as a string.",
             "Take the id of the proposal from the state.",
         )
     })?;
-    shared
-        .console
-        .change(|state, now| state.decide(viewer, id, decision, now))?;
-    Ok(StatusCode::NO_CONTENT)
+    by.change(StatusCode::NO_CONTENT, |state, now| {
+        state.decide(by.viewer, id, asked.decision, now)
+    })
 }
 
 #[derive(Deserialize)]
@@ -67,25 +57,18 @@ pub(super) struct Corrected {
 }
 
 pub(super) async fn correct(
-    State(shared): State<Shared>,
-    Viewer(viewer): Viewer,
-    body: Result<Json<Correct>, JsonRejection>,
+    by: By,
+    Body(Correct { pick, place }): Body<Correct>,
 ) -> Result<Json<Corrected>, Failure> {
-    let Json(Correct { pick, place }) = body?;
-    let id = shared
-        .console
-        .change(|state, _| state.correct(viewer, pick, place))?;
+    let correct = |state: &mut crate::console::State, _| state.correct(by.viewer, pick, place);
+    let id = by.shared.console.change(correct)?;
     Ok(Json(Corrected {
         proposal_id: id.to_string(),
     }))
 }
 
-pub(super) async fn home(
-    State(shared): State<Shared>,
-    Viewer(viewer): Viewer,
-) -> Result<StatusCode, Failure> {
-    shared.console.change(|state, _| state.home(viewer))?;
-    Ok(StatusCode::ACCEPTED)
+pub(super) async fn home(by: By) -> Answer {
+    by.change(StatusCode::ACCEPTED, |state, _| state.home(by.viewer))
 }
 
 #[derive(Deserialize)]
@@ -94,14 +77,8 @@ pub(super) struct SetStep {
     step: u32,
 }
 
-pub(super) async fn set_step(
-    State(shared): State<Shared>,
-    Viewer(viewer): Viewer,
-    body: Result<Json<SetStep>, JsonRejection>,
-) -> Result<StatusCode, Failure> {
-    let Json(SetStep { step }) = body?;
-    shared
-        .console
-        .change(|state, _| state.set_step(viewer, step))?;
-    Ok(StatusCode::ACCEPTED)
+pub(super) async fn set_step(by: By, Body(SetStep { step }): Body<SetStep>) -> Answer {
+    by.change(StatusCode::ACCEPTED, |state, _| {
+        state.set_step(by.viewer, step)
+    })
 }

@@ -1,46 +1,54 @@
 //! Lessons, the library of what was taught, and repeating it.
 
-use axum::extract::rejection::JsonRejection;
+use std::collections::BTreeMap;
+
 use axum::extract::{Json, Path, State};
 use axum::http::StatusCode;
 use axum::response::Response;
 use heightmap::Workspace;
 use msgs::convert;
 use pick_place::PrimitiveSettings;
-use serde::Deserialize;
+use serde::{Deserialize, Serialize};
 
-use super::access::{Failure, Viewer};
+use super::access::{Answer, Body, By, Failure};
 use super::pictures::picture;
 use super::{Named, Shared, on_files};
-use crate::library::{Entry, Library};
+use crate::library::{Entry, Libraries};
+use crate::refusal::Refusal;
 use crate::run::Pose;
 
-pub(super) async fn begin_lesson(
-    State(shared): State<Shared>,
-    Viewer(viewer): Viewer,
-) -> Result<StatusCode, Failure> {
-    shared
-        .console
-        .change(|state, _| state.begin_lesson(viewer))?;
-    Ok(StatusCode::NO_CONTENT)
+pub(super) async fn begin_lesson(by: By) -> Answer {
+    by.change(StatusCode::NO_CONTENT, |state, _| {
+        state.begin_lesson(by.viewer)
+    })
 }
 
-pub(super) async fn end_lesson(
-    State(shared): State<Shared>,
-    Viewer(viewer): Viewer,
-) -> Result<StatusCode, Failure> {
-    shared.console.change(|state, _| state.end_lesson(viewer))?;
-    Ok(StatusCode::NO_CONTENT)
+pub(super) async fn end_lesson(by: By) -> Answer {
+    by.change(StatusCode::NO_CONTENT, |state, _| {
+        state.end_lesson(by.viewer)
+    })
 }
 
-/// Heights and speeds of a step that is shown.
-#[derive(Clone, Copy, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub(super) enum Preset {
-    /// High and fast.
-    Rigid,
-    /// Low and slow.
-    Gentle,
+/// Heights and speeds that a step can be shown with.
+#[derive(Serialize)]
+pub(super) struct Settings {
+    /// For rigid objects; for soft objects and chains.
+    presets: BTreeMap<&'static str, PrimitiveSettings>,
+    /// Smallest and largest value of each setting.
+    ranges: BTreeMap<&'static str, [f64; 2]>,
+}
+
+pub(super) async fn settings() -> Json<Settings> {
+    let ranges = PrimitiveSettings::RANGES.into_iter();
+    Json(Settings {
+        presets: BTreeMap::from([
+            ("rigid", PrimitiveSettings::RIGID),
+            ("gentle", PrimitiveSettings::BEADS),
+        ]),
+        ranges: ranges
+            .map(|(name, low, high)| (name, [low, high]))
+            .collect(),
+    })
 }
 
 #[derive(Deserialize)]
@@ -48,27 +56,37 @@ pub(super) enum Preset {
 pub(super) struct Show {
     pick: Pose,
     place: Pose,
-    preset: Preset,
+    settings: PrimitiveSettings,
 }
 
-pub(super) async fn show_step(
-    State(shared): State<Shared>,
-    Viewer(viewer): Viewer,
-    body: Result<Json<Show>, JsonRejection>,
-) -> Result<StatusCode, Failure> {
-    let Json(Show {
+pub(super) async fn show_step(by: By, Body(asked): Body<Show>) -> Answer {
+    let Show {
         pick,
         place,
-        preset,
-    }) = body?;
-    let settings = convert::settings_to_msg(&match preset {
-        Preset::Rigid => PrimitiveSettings::RIGID,
-        Preset::Gentle => PrimitiveSettings::BEADS,
-    });
-    shared
-        .console
-        .change(|state, now| state.show_step(viewer, pick, place, settings, now))?;
-    Ok(StatusCode::ACCEPTED)
+        settings,
+    } = asked;
+    settings.check().map_err(|error| {
+        Refusal::new(
+            format!("The motion is out of range: {error}."),
+            "Choose heights and speeds within their ranges.",
+        )
+    })?;
+    let settings = convert::settings_to_msg(&settings);
+    by.change(StatusCode::ACCEPTED, |state, now| {
+        state.show_step(by.viewer, pick, place, settings, now)
+    })
+}
+
+pub(super) async fn execute_step(by: By) -> Answer {
+    by.change(StatusCode::ACCEPTED, |state, now| {
+        state.execute_step(by.viewer, now)
+    })
+}
+
+pub(super) async fn change_step(by: By) -> Answer {
+    by.change(StatusCode::NO_CONTENT, |state, _| {
+        state.change_step(by.viewer)
+    })
 }
 
 #[derive(Deserialize)]
@@ -77,53 +95,56 @@ pub(super) struct Judge {
     reached: bool,
 }
 
-pub(super) async fn judge_step(
-    State(shared): State<Shared>,
-    Viewer(viewer): Viewer,
-    body: Result<Json<Judge>, JsonRejection>,
-) -> Result<StatusCode, Failure> {
-    let Json(Judge { reached }) = body?;
-    shared
+pub(super) async fn judge_step(by: By, Body(Judge { reached }): Body<Judge>) -> Answer {
+    by.change(StatusCode::NO_CONTENT, |state, _| {
+        state.judge_step(by.viewer, reached)
+    })
+}
+
+pub(super) async fn undo_step(by: By) -> Answer {
+    by.change(StatusCode::ACCEPTED, |state, now| {
+        state.undo_step(by.viewer, now)
+    })
+}
+
+pub(super) async fn save_lesson(by: By, Body(Named { name }): Body<Named>) -> Answer {
+    let demonstration = by
+        .shared
         .console
-        .change(|state, _| state.judge_step(viewer, reached))?;
+        .change_quietly(|state, _| state.lesson_demonstration(by.viewer, &name))?;
+    on_files(&by.shared, move |libraries| {
+        libraries.tasks.save(&name, &demonstration)
+    })
+    .await??;
+    by.shared.console.change(|state, _| state.lesson_saved());
     Ok(StatusCode::NO_CONTENT)
 }
 
-pub(super) async fn undo_step(
-    State(shared): State<Shared>,
-    Viewer(viewer): Viewer,
-) -> Result<StatusCode, Failure> {
-    shared
-        .console
-        .change(|state, now| state.undo_step(viewer, now))?;
-    Ok(StatusCode::ACCEPTED)
-}
-
-pub(super) async fn save_lesson(
-    State(shared): State<Shared>,
-    Viewer(viewer): Viewer,
-    body: Result<Json<Named>, JsonRejection>,
-) -> Result<StatusCode, Failure> {
-    let Json(Named { name }) = body?;
-    let demonstration = shared
-        .console
-        .change_quietly(|state, _| state.lesson_demonstration(viewer, &name))?;
-    on_files(&shared, move |library| library.save(&name, &demonstration)).await??;
-    shared.console.change(|state, _| state.lesson_saved());
-    Ok(StatusCode::NO_CONTENT)
+/// What can be repeated, and what can be learned from besides.
+#[derive(Serialize)]
+pub(super) struct Demonstrations {
+    tasks: Vec<Entry>,
+    corrections: Vec<Entry>,
 }
 
 pub(super) async fn demonstrations(
     State(shared): State<Shared>,
-) -> Result<Json<Vec<Entry>>, Failure> {
-    Ok(Json(on_files(&shared, Library::list).await?))
+) -> Result<Json<Demonstrations>, Failure> {
+    let list = |libraries: &Libraries| Demonstrations {
+        tasks: libraries.tasks(),
+        corrections: libraries.corrections.list(),
+    };
+    Ok(Json(on_files(&shared, list).await?))
 }
 
 pub(super) async fn demonstration_picture(
     State(shared): State<Shared>,
     Path((name, step)): Path<(String, usize)>,
 ) -> Result<Response, Failure> {
-    let heightmap = on_files(&shared, move |library| library.picture(&name, step)).await??;
+    let heightmap = on_files(&shared, move |libraries| {
+        libraries.holding(&name).picture(&name, step)
+    })
+    .await??;
     let Workspace { rows, cols, .. } = heightmap.workspace;
     Ok(picture(
         step as u64,
@@ -134,15 +155,9 @@ pub(super) async fn demonstration_picture(
     ))
 }
 
-pub(super) async fn repeat(
-    State(shared): State<Shared>,
-    Viewer(viewer): Viewer,
-    body: Result<Json<Named>, JsonRejection>,
-) -> Result<StatusCode, Failure> {
-    let Json(Named { name }) = body?;
-    let path = shared.library.path(&name)?;
-    shared
-        .console
-        .change(|state, _| state.repeat(viewer, path))?;
-    Ok(StatusCode::ACCEPTED)
+pub(super) async fn repeat(by: By, Body(Named { name }): Body<Named>) -> Answer {
+    let path = by.shared.libraries.tasks.path(&name)?;
+    by.change(StatusCode::ACCEPTED, |state, _| {
+        state.repeat(by.viewer, name, path)
+    })
 }

@@ -1,13 +1,12 @@
 //! Who watches and who decides.
 
-use axum::extract::rejection::JsonRejection;
 use axum::extract::{Json, State};
 use axum::http::StatusCode;
 use serde::{Deserialize, Serialize};
 use tracing::info;
 
 use super::Shared;
-use super::access::{Failure, Viewer};
+use super::access::{Answer, Body, By, Failure};
 use crate::refusal::Refusal;
 use crate::session::ViewerId;
 
@@ -25,9 +24,8 @@ pub(super) struct Joined {
 
 pub(super) async fn join(
     State(shared): State<Shared>,
-    body: Result<Json<Join>, JsonRejection>,
+    Body(Join { name }): Body<Join>,
 ) -> Result<Json<Joined>, Failure> {
-    let Json(Join { name }) = body?;
     let session = crate::secret();
     let key = session.clone();
     let viewer = shared
@@ -37,15 +35,15 @@ pub(super) async fn join(
     Ok(Json(Joined { viewer, session }))
 }
 
-pub(super) async fn leave(State(shared): State<Shared>, Viewer(viewer): Viewer) -> StatusCode {
-    shared
+pub(super) async fn leave(by: By) -> StatusCode {
+    by.shared
         .console
-        .change(|state, _| state.sessions.leave(viewer));
+        .change(|state, _| state.sessions.leave(by.viewer));
     StatusCode::NO_CONTENT
 }
 
 /// A sign of life of a program without a WebSocket.
-pub(super) async fn presence(Viewer(_): Viewer) -> StatusCode {
+pub(super) async fn presence(_: By) -> StatusCode {
     StatusCode::NO_CONTENT
 }
 
@@ -58,16 +56,11 @@ pub(super) enum ChangeOperator {
     HandOver { to: Option<ViewerId> },
 }
 
-pub(super) async fn change_operator(
-    State(shared): State<Shared>,
-    Viewer(viewer): Viewer,
-    body: Result<Json<ChangeOperator>, JsonRejection>,
-) -> Result<StatusCode, Failure> {
-    let Json(change) = body?;
-    let operator = shared.console.change(|state, _| {
+pub(super) async fn change_operator(by: By, Body(change): Body<ChangeOperator>) -> Answer {
+    let operator = by.shared.console.change(|state, _| {
         match change {
-            ChangeOperator::Take { from } => state.sessions.take(viewer, from),
-            ChangeOperator::HandOver { to } => state.sessions.hand_over(viewer, to),
+            ChangeOperator::Take { from } => state.sessions.take(by.viewer, from),
+            ChangeOperator::HandOver { to } => state.sessions.hand_over(by.viewer, to),
         }?;
         let operator = state.sessions.operator();
         Ok::<_, Refusal>(operator.map(|id| state.sessions.name(id).to_owned()))

@@ -68,13 +68,15 @@ pub(super) async fn camera_image(
     Ok(picture(number, height, width, &rgb, &[]))
 }
 
-/// The planned motion of the present proposal.
+/// The planned motion of what waits for an approval: of the way home, of the step of a lesson, or of the present proposal.
 pub(super) async fn motion(State(shared): State<Shared>) -> Result<Json<Motion>, Failure> {
-    let motion = shared.console.read(|state, _| state.run.motion().cloned());
+    let motion = shared
+        .console
+        .read(|state, _| state.pending_motion().cloned());
     motion.map(Json).ok_or_else(|| {
         Failure::new(
             StatusCode::NOT_FOUND,
-            "The executor has not planned the motion of the present proposal.",
+            "The executor has planned no motion that waits for an approval.",
             "Wait a moment.",
         )
     })

@@ -3,17 +3,16 @@
 use std::collections::BTreeSet;
 use std::sync::Arc;
 
-use axum::extract::rejection::JsonRejection;
 use axum::extract::{Json, State};
 use axum::http::StatusCode;
 use serde::Deserialize;
 
-use super::access::{Failure, Viewer};
+use super::access::{Answer, Body, By, Failure};
 use super::{Named, Shared, off_thread, on_files};
 use crate::checkpoints::Checkpoint;
 use crate::lesson::check_name;
 use crate::refusal::Refusal;
-use crate::training::Order;
+use crate::training::{Example, Order};
 
 /// Most gradient steps of a training.
 const MOST_TRAINING_STEPS: u64 = 100_000;
@@ -26,49 +25,32 @@ pub(super) async fn list_checkpoints(
     Ok(Json(off_thread(move || checkpoints.list()).await?))
 }
 
-pub(super) async fn use_checkpoint(
-    State(shared): State<Shared>,
-    Viewer(viewer): Viewer,
-    body: Result<Json<Named>, JsonRejection>,
-) -> Result<StatusCode, Failure> {
-    let Json(Named { name }) = body?;
-    let checkpoints = Arc::clone(&shared.checkpoints);
+pub(super) async fn use_checkpoint(by: By, Body(Named { name }): Body<Named>) -> Answer {
+    let checkpoints = Arc::clone(&by.shared.checkpoints);
     let path = off_thread(move || checkpoints.path(&name)).await??;
-    shared
-        .console
-        .change(|state, _| state.use_checkpoint(viewer, path))?;
-    Ok(StatusCode::ACCEPTED)
+    by.change(StatusCode::ACCEPTED, |state, _| {
+        state.use_checkpoint(by.viewer, path)
+    })
 }
 
-pub(super) async fn use_previous_checkpoint(
-    State(shared): State<Shared>,
-    Viewer(viewer): Viewer,
-) -> Result<StatusCode, Failure> {
-    shared
-        .console
-        .change(|state, _| state.use_previous_checkpoint(viewer))?;
-    Ok(StatusCode::ACCEPTED)
+pub(super) async fn use_previous_checkpoint(by: By) -> Answer {
+    by.change(StatusCode::ACCEPTED, |state, _| {
+        state.use_previous_checkpoint(by.viewer)
+    })
 }
 
 #[derive(Deserialize)]
 #[serde(deny_unknown_fields)]
 pub(super) struct StartTraining {
     name: String,
-    /// Demonstrations of the library to learn from, and those that are held out.
+    /// Demonstrations and corrections to learn from, and those that are held out.
     learn: Vec<String>,
     held_out: Vec<String>,
     steps: u64,
 }
 
-pub(super) async fn start_training(
-    State(shared): State<Shared>,
-    Viewer(viewer): Viewer,
-    body: Result<Json<StartTraining>, JsonRejection>,
-) -> Result<StatusCode, Failure> {
-    let Json(asked) = body?;
-    shared
-        .console
-        .read(|state, _| state.sessions.check_operator(viewer))?;
+pub(super) async fn start_training(by: By, Body(asked): Body<StartTraining>) -> Answer {
+    by.check_operator()?;
     let StartTraining {
         name,
         learn,
@@ -90,8 +72,8 @@ pub(super) async fn start_training(
         )
         .into());
     }
-    let order = on_files(&shared, move |library| {
-        let entries = library.list();
+    let order = on_files(&by.shared, move |libraries| {
+        let entries = [libraries.tasks.list(), libraries.corrections.list()].concat();
         let chosen = |names: &[String]| {
             let entry = |name: &String| {
                 let mut entries = entries.iter();
@@ -102,7 +84,7 @@ pub(super) async fn start_training(
                         "Choose another one.",
                     )
                 })?;
-                Ok((library.path(name)?, entry.problem.clone()))
+                Ok((libraries.holding(name).path(name)?, entry.problem.clone()))
             };
             names.iter().map(entry).collect::<Result<Vec<_>, Refusal>>()
         };
@@ -116,17 +98,17 @@ pub(super) async fn start_training(
             steps,
         })
     });
-    shared.trainings.start(order.await??)?;
+    by.shared.trainings.start(order.await??)?;
     Ok(StatusCode::ACCEPTED)
 }
 
-pub(super) async fn cancel_training(
-    State(shared): State<Shared>,
-    Viewer(viewer): Viewer,
-) -> Result<StatusCode, Failure> {
-    shared
-        .console
-        .read(|state, _| state.sessions.check_operator(viewer))?;
-    shared.trainings.cancel();
+pub(super) async fn cancel_training(by: By) -> Answer {
+    by.check_operator()?;
+    by.shared.trainings.cancel();
     Ok(StatusCode::NO_CONTENT)
+}
+
+/// The held-out steps of the last comparison: as shown, and as both policies propose them.
+pub(super) async fn comparison(State(shared): State<Shared>) -> Json<Vec<Example>> {
+    Json(shared.trainings.examples())
 }

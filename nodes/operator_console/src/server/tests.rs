@@ -46,7 +46,7 @@ impl Client {
         Self {
             router: router(
                 console,
-                Arc::new(Library::new("no/such/folder".into())),
+                Arc::new(Libraries::new(std::path::Path::new("no/such/folder"))),
                 Arc::new(Checkpoints::new(["no/such".into(), "folder".into()])),
                 Arc::new(Trainings::new(
                     "no/such/program".into(),
@@ -416,6 +416,7 @@ fn the_description_tells_every_field_of_the_state() {
         "lesson",
         "policy",
         "training",
+        "home",
         "reward",
         "joints",
         "motion",
@@ -431,4 +432,26 @@ fn the_description_tells_every_field_of_the_state() {
     }
     let schema = &description["components"]["schemas"]["State"];
     assert_eq!(undescribed(&description, schema, &state, "state"), [""; 0]);
+}
+
+#[tokio::test]
+async fn answers_are_what_the_description_says() {
+    let description: serde_json::Value = serde_yaml_ng::from_str(DESCRIPTION).unwrap();
+    let client = Client::new();
+    for path in [
+        "/api/v1/state",
+        "/api/v1/cameras",
+        "/api/v1/checkpoints",
+        "/api/v1/demonstrations",
+        "/api/v1/lesson/settings",
+        "/api/v1/training/comparison",
+    ] {
+        let answer = client.ask(Method::GET, path, &[], "").await;
+        assert_eq!(answer.status, StatusCode::OK, "{path}");
+        let schema = &description["paths"][path]["get"]["responses"]["200"]["content"]["application/json"]
+            ["schema"];
+        assert!(schema.is_object(), "{path}");
+        let mistakes = undescribed(&description, schema, &answer.json(), path);
+        assert_eq!(mistakes, [""; 0]);
+    }
 }

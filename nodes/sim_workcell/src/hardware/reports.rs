@@ -5,7 +5,7 @@ use std::time::Duration;
 use heightmap::Camera;
 use msgs::convert::{self, ConvertError};
 use msgs::rosgraph_msgs::Clock;
-use msgs::std_msgs::{Bool, Header};
+use msgs::std_msgs::{Bool, Float64, Header};
 use msgs::tf2_msgs::TFMessage;
 use msgs::trajectory_msgs::JointTrajectoryPoint;
 use msgs::ur_dashboard_msgs::{RobotMode, SafetyMode};
@@ -104,6 +104,8 @@ impl Hardware {
             return;
         }
         self.tool_data.publish(self.cell.tool_data());
+        let percent = 100.0 * self.parameters.hardware.speed_scaling;
+        self.speed_scaling.publish(Float64 { data: percent });
         self.published_pins = self.cell.io_states();
         self.io_states.publish(self.published_pins.clone());
         self.next_pins = self.after(self.status_period_s());

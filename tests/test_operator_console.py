@@ -24,7 +24,7 @@ from typing import Any
 
 import pytest
 import teaching
-from browser import Person, address_of, chromium
+from browser import PATIENCE_MS, Person, address_of, chromium
 from cell_operator import EVENT, Operator, nanoseconds
 from playwright.sync_api import Browser, expect
 from processes import REPOSITORY, Process
@@ -182,7 +182,7 @@ def test_a_person_rejects_once_and_then_approves_a_run_of_stacking_to_its_end_by
     with AnyReader([tmp_path / "record/run"]) as reader:
         chosen = [connection for connection in reader.connections if connection.topic in ("/step_confirmation", "/pick_place")]
         recorded = [(c.topic, reader.deserialize(raw, c.msgtype)) for c, _, raw in reader.messages(chosen)]
-    names = [(one.operator_name, one.header.stamp.sec > 0) for topic, one in recorded if topic == "/step_confirmation"]
+    names = [(one.operator_name, nanoseconds(one.header.stamp) > 0) for topic, one in recorded if topic == "/step_confirmation"]
     assert names == [("Ada", True)] * len(said)
     assert {one.checkpoint for topic, one in recorded if topic == "/pick_place"} == {"ten_problems"}
 
@@ -396,7 +396,7 @@ def test_a_task_that_no_module_programs_is_taught_by_clicks_and_the_shipped_poli
     ada.page.get_by_label("Name of the policy").fill("taught")
     ada.page.get_by_role("spinbutton", name="Steps").fill(str(TRAINING_STEPS))
     ada.button("Train").click()
-    expect(ada.page.get_by_text("taught is trained.")).to_be_visible()
+    expect(ada.page.get_by_text("taught is trained.")).to_be_visible(timeout=5 * PATIENCE_MS)
     compared = ada.page.get_by_role("table", name="Median distance from 3 held-out steps")
     distances = r"pick [0-9.]+ mm, place [0-9.]+ mm, turn [0-9.]+°"
     expect(ada.page.get_by_text(re.compile(rf"Step {TRAINING_STEPS}: {distances} from the held-out steps"))).to_be_visible()

@@ -216,17 +216,23 @@ impl State {
             self.sessions.check_operator(viewer)?;
             self.check_no_lesson()?;
         }
+        let current = self.run.current_id();
+        let not_present = || {
+            Refusal::new(
+                format!("Proposal {proposal_id} is not the present one."),
+                "The view has changed since. Look at the present proposal.",
+            )
+        };
+        if decision != Decision::Stop && current.is_some_and(|current| current != proposal_id) {
+            return Err(not_present());
+        }
         if self.lesson.is_none() || decision != Decision::Stop {
             self.run.check(decision, now)?;
         }
         if decision == Decision::Stop {
             self.drop_planning();
-        }
-        if decision != Decision::Stop && self.run.current_id() != Some(proposal_id) {
-            return Err(Refusal::new(
-                format!("Proposal {proposal_id} is not the present one."),
-                "The view has changed since. Look at the present proposal.",
-            ));
+        } else {
+            current.ok_or_else(not_present)?;
         }
         let confirmation = StepConfirmation {
             proposal_id,

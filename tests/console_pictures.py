@@ -9,8 +9,8 @@ import pathlib
 import sys
 import tempfile
 
-from browser import Person, address_of, chromium
-from playwright.sync_api import Page
+from browser import PATIENCE_MS, Person, address_of, chromium
+from playwright.sync_api import Page, expect
 from processes import Process, free_domain
 from test_operator_console import until
 
@@ -72,7 +72,9 @@ def main() -> None:
             ada.page.get_by_label("Name of the policy").fill("taught")
             ada.page.get_by_role("spinbutton", name="Steps").fill("40")
             ada.button("Train").click()
-            ada.sees("taught is trained.")
+            expect(ada.page.get_by_text("taught is trained.")).to_be_visible(timeout=5 * PATIENCE_MS)
+            for board in ("as shown", "by taught", "by the policy of now"):
+                expect(ada.page.get_by_role("img", name=f"one_block_again, step 1, {board}")).to_be_visible()
             picture(ada.page, folder, "train")
         finally:
             launch.end()

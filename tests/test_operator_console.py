@@ -461,6 +461,7 @@ def test_a_program_approves_a_step_and_is_refused_what_is_stale(start, decided) 
         console.decide("approve", second["proposal"])
     state = console.wait("awaiting_confirmation")
     assert state["steps"][-1]["proposal"]["id"] == second["proposal"]["id"]
+    until(lambda: len(decided()) >= 2, "decisions on the graph", 30.0)
     said = [one.decision for one in decided()]
     assert said == [StepConfirmation.REJECT, StepConfirmation.APPROVE]
 
@@ -558,4 +559,5 @@ def test_hostile_input_moves_nothing_and_the_page_works_on(start, decided) -> No
     with concurrent.futures.ThreadPoolExecutor(8) as tabs:
         assert sum(tabs.map(approve, range(8))) == 1
     console.wait("awaiting_confirmation")
+    until(decided, "decision on the graph", 30.0)
     assert [one.decision for one in decided()] == [StepConfirmation.APPROVE]

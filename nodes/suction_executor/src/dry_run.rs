@@ -12,10 +12,11 @@ use msgs::{sctn_msgs, trajectory_msgs};
 use nalgebra::{Isometry2, Point2};
 use pick_place::{PrimitiveSettings, Robot, go_home};
 use step_protocol::{JointPositions, Proposal, RobotState};
+use ur_driver::ContactSign;
+use ur_driver::status::DriverStatus;
 use ur5::{Arm, JointTrajectory, Joints, TrajectoryPoint};
 
-use crate::parameters::{Contact, ContactSign};
-use crate::status::DriverStatus;
+use crate::parameters::Contact;
 use crate::surface::{top_m, touchdown};
 
 /// The way home is slow, because something may be held or in the way, and begins with a rise as high as the arm can.
@@ -251,12 +252,38 @@ impl RobotNow {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::status::tests::ready;
-    use crate::status::{Newest, Pins};
+    use msgs::convert::JointReading;
     use nalgebra::{Isometry2, Vector2};
     use pick_place::{PickPlace, PrimitiveSettings};
     use step_protocol::ProposalId;
+    use ur_driver::status::{Newest, Pins};
     use ur5::WorkCell;
+
+    /// A driver that is ready.
+    fn ready() -> DriverStatus {
+        let reading = JointReading {
+            stamp: Duration::from_secs(5),
+            positions_rad: Joints::zeros(),
+            velocities_rad_s: Joints::zeros(),
+        };
+        DriverStatus {
+            // RUNNING and NORMAL.
+            robot_mode: Some(7),
+            safety_mode: Some(1),
+            program_running: Some(true),
+            joints: Some(Newest {
+                value: reading,
+                at: Duration::ZERO,
+                count: 1,
+            }),
+            pins: Some(Newest {
+                value: Pins::default(),
+                at: Duration::ZERO,
+                count: 1,
+            }),
+            ..DriverStatus::default()
+        }
+    }
 
     fn proposal(x_m: f64) -> Proposal {
         let pose = |y_m| Isometry2::new(Vector2::new(x_m, y_m), 0.0);
@@ -284,7 +311,7 @@ mod tests {
     #[test]
     fn only_what_can_be_planned_to_its_end_may_begin() {
         let arm = WorkCell::builtin().unwrap().arm;
-        let mut status = ready(Duration::ZERO);
+        let mut status = ready();
         status.joints.as_mut().unwrap().value.positions_rad = arm.home;
         let mut robot = RobotNow {
             arm,
@@ -404,7 +431,7 @@ mod tests {
     fn robot_at(y_m: f64, height_m: f64) -> RobotNow {
         let arm = WorkCell::builtin().unwrap().arm;
         let over = Isometry2::new(Vector2::new(0.5, y_m), 0.0);
-        let mut status = ready(Duration::ZERO);
+        let mut status = ready();
         let joints = arm.solve(&Arm::tip_down(&over, height_m), &arm.ready);
         status.joints.as_mut().unwrap().value.positions_rad = joints.unwrap();
         RobotNow {

@@ -22,15 +22,15 @@ use step_protocol::{ApprovalGate, GateRules, Proposal};
 use tokio::sync::{mpsc, watch};
 use tokio::time::timeout_at;
 use tracing::warn;
+use ur_driver::DriverClient;
+use ur_driver::status::DriverStatus;
 use ur5::WorkCell;
 
 use self::action::{Goal, cancel_of};
 use self::motion::{Motion, StopCause, end_of};
-use crate::driver::DriverClient;
 use crate::dry_run::RobotNow;
 use crate::parameters::SuctionExecutorParameters;
 use crate::presence::Presence;
-use crate::status::DriverStatus;
 use crate::stop_memory::StopMemory;
 
 /// How long a motion may take to stop when the node is deactivated.
@@ -44,7 +44,7 @@ pub async fn configure(
     node: Node,
     parameters: SuctionExecutorParameters,
 ) -> anyhow::Result<ExecutorNode> {
-    crate::planted::check()?;
+    ur_driver::planted::check()?;
     let work_cell = match parameters.urdf.as_path() {
         path if path == Path::new("") => WorkCell::builtin(),
         path => WorkCell::load(path),

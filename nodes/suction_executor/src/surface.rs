@@ -3,8 +3,9 @@
 use heightmap::Heightmap;
 use nalgebra::Point2;
 use pick_place::{PickPlace, Touchdown};
+use ur_driver::ContactSign;
 
-use crate::parameters::{Contact, ContactSign};
+use crate::parameters::Contact;
 
 /// The cup rests on what is this near (m).
 const CUP_RADIUS_M: f64 = 0.008;

@@ -13,11 +13,11 @@ use tokio::runtime::Handle;
 use tokio::task::JoinHandle;
 use tokio_util::sync::CancellationToken;
 use tracing::{info, warn};
+use ur_driver::planted::{Planted, is_planted};
+use ur_driver::{DriverError, DriverRobot};
 
 use super::Executor;
-use crate::driver::{DriverError, DriverRobot};
 use crate::dry_run::HOME_SETTINGS;
-use crate::planted::{Planted, is_planted};
 use crate::surface::touchdown;
 
 /// What moves the arm.

@@ -5,10 +5,10 @@ use std::sync::Arc;
 use pick_place::Robot as _;
 use step_protocol::{OperatorDecision, Proposal, ProposalId, ProposalStatus, StepOutcome};
 use tokio_util::sync::CancellationToken;
+use ur_driver::DriverRobot;
+use ur_driver::planted::{Planted, is_planted};
 
 use super::Executor;
-use crate::driver::DriverRobot;
-use crate::planted::{Planted, is_planted};
 
 /// What planted faults remember.
 #[derive(Debug, Default)]

@@ -7,11 +7,11 @@ use msgs::sensor_msgs::JointState;
 use msgs::std_msgs::Bool;
 use msgs::ur_dashboard_msgs::{RobotMode, SafetyMode};
 use msgs::ur_msgs::{Digital, IOStates};
-use node_kit::{Node, Qos, TaskGroup};
+use node_kit::{Node, NodeError, Qos, TaskGroup};
 use tokio::sync::watch;
 use ur5::WorkCell;
 
-use crate::parameters::Driver;
+use crate::DriverParameters;
 use crate::status::{DriverStatus, Pins, StillRule};
 
 /// Joints move less than this from one reading to the next while they stand still: the noise of encoders of 2e-5 rad.
@@ -21,10 +21,10 @@ const STILL_STEP_RAD: f64 = 2e-4;
 pub(crate) fn follow_status(
     node: &Node,
     tasks: &TaskGroup,
-    driver: &Driver,
+    driver: &DriverParameters,
     work_cell: &WorkCell,
     origin: Instant,
-) -> anyhow::Result<watch::Receiver<DriverStatus>> {
+) -> Result<watch::Receiver<DriverStatus>, NodeError> {
     let topic = |name| format!("{}/{name}", driver.io_and_status);
     let mut joint_states = node.subscription::<JointState>("joint_states", Qos::Event)?;
     let mut io_states = node.subscription::<IOStates>(&topic("io_states"), Qos::Event)?;

@@ -4,11 +4,11 @@ use std::time::Duration;
 
 use msgs::controller_manager_msgs::{ControllerState, ListControllers, ListControllersRequest};
 use msgs::ur_msgs::{GetRobotSoftwareVersion, GetRobotSoftwareVersionRequest, ToolDataMsg};
-use node_kit::{CallOptions, Node, Qos, ServiceClient, Subscription};
+use node_kit::{CallOptions, Node, NodeError, Qos, ServiceClient, Subscription};
 use tokio::sync::watch;
 use tracing::{info, warn};
 
-use crate::parameters::{ContactSign, Driver};
+use crate::{ContactSign, DriverParameters};
 
 /// Detects contact for the action that moves until contact.
 const TOOL_CONTACT: &str = "tool_contact_controller";
@@ -47,15 +47,15 @@ struct Checks {
     version: ServiceClient<GetRobotSoftwareVersion>,
     tool_data: Subscription<ToolDataMsg>,
     tool_voltage: Option<u8>,
-    driver: Driver,
+    driver: DriverParameters,
 }
 
 /// Checks the driver now and again. An answer that does not come changes nothing once everything was found in order: the streams tell
 /// whether the driver lives.
 pub(crate) fn watch_readiness(
     node: &Node,
-    driver: &Driver,
-) -> anyhow::Result<watch::Receiver<Readiness>> {
+    driver: &DriverParameters,
+) -> Result<watch::Receiver<Readiness>, NodeError> {
     if !driver.check_controllers {
         return Ok(watch::channel(Readiness::Ready).1);
     }
@@ -135,7 +135,10 @@ impl Checks {
 }
 
 /// Names a controller that is not there or not active.
-fn missing_controller(driver: &Driver, controllers: &[ControllerState]) -> Option<String> {
+fn missing_controller(
+    driver: &DriverParameters,
+    controllers: &[ControllerState],
+) -> Option<String> {
     let of = |action: &str| {
         let name = action.trim_start_matches('/').split('/').next();
         name.unwrap_or_default().to_owned()
@@ -158,7 +161,7 @@ fn missing_controller(driver: &Driver, controllers: &[ControllerState]) -> Optio
 }
 
 /// Names a pin at the tool that has no power.
-fn powerless_pin(driver: &Driver, tool_voltage: Option<u8>) -> Readiness {
+fn powerless_pin(driver: &DriverParameters, tool_voltage: Option<u8>) -> Readiness {
     let pins = [driver.suction_pin, driver.vacuum_pin];
     let Some(pin) = pins.into_iter().find(|pin| *pin >= TOOL_PINS_FROM) else {
         return Readiness::Ready;

@@ -1,13 +1,12 @@
-//! The robot behind the UR driver's topics, service and actions.
-//!
-//! A goal is sent once: rclcpp's servers do not allow the same goal twice, and the answer of a real driver may come late. A stop, a
-//! fault, a deactivation and the end of the process act at any time, before the answer too; then both actions are cancelled and the arm
-//! is watched until it rests. A goal that is accepted after that is cancelled.
+#![doc = include_str!("../README.md")]
 
 mod heartbeat;
 mod motion;
+mod parameters;
+pub mod planted;
 mod readiness;
 mod robot;
+pub mod status;
 mod streams;
 #[cfg(test)]
 mod tests;
@@ -18,21 +17,21 @@ use std::time::{Duration, Instant};
 use msgs::control_msgs::{FollowJointTrajectory, JointTolerance};
 use msgs::ur_msgs::{FollowJointTrajectoryUntil, SetIO};
 use msgs::{convert, trajectory_msgs};
-use node_kit::{ActionClient, CallOptions, Clock, Node, ServiceClient, TaskGroup};
+use node_kit::{ActionClient, CallOptions, Clock, Node, NodeError, ServiceClient, TaskGroup};
 use tokio::sync::watch;
 use ur5::{JointTrajectory, WorkCell};
 
-use self::heartbeat::Heartbeat;
 use self::readiness::{Readiness, watch_readiness};
+use self::status::DriverStatus;
 use self::streams::follow_status;
-use crate::parameters::Driver;
-use crate::status::DriverStatus;
 
-pub(crate) use self::robot::DriverRobot;
+pub use self::heartbeat::{ActivateError, ActiveExecutor, Heartbeat};
+pub use self::parameters::{ContactSign, DriverParameters};
+pub use self::robot::DriverRobot;
 
 /// Why the robot does not go on. Suction stays as it is: holding is safer than dropping.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
-pub(crate) enum DriverError {
+pub enum DriverError {
     /// The motion was stopped; whoever stopped it knows why.
     #[error("stopped")]
     Stopped,
@@ -48,28 +47,34 @@ impl DriverError {
 }
 
 /// The way to the driver.
-pub(crate) struct DriverClient {
+pub struct DriverClient {
     follow: Arc<ActionClient<FollowJointTrajectory>>,
     until: Arc<ActionClient<FollowJointTrajectoryUntil>>,
     set_io: ServiceClient<SetIO>,
     readiness: watch::Receiver<Readiness>,
-    pub(crate) status: watch::Receiver<DriverStatus>,
-    pub(crate) heartbeat: Heartbeat,
-    parameters: Driver,
+    /// The newest status of the driver.
+    pub status: watch::Receiver<DriverStatus>,
+    /// What the watchdog and other executors hear.
+    pub heartbeat: Heartbeat,
+    parameters: DriverParameters,
     joint_names: [String; 6],
     clock: Clock,
     /// Origin of the times of arrival in the status.
-    pub(crate) origin: Instant,
+    pub origin: Instant,
     /// They go on until a motion under way is stopped, whatever becomes of the node.
     tasks: TaskGroup,
 }
 
 impl DriverClient {
-    pub(crate) fn new(
+    /// Looks for the driver's topics, services and actions, and follows its status.
+    ///
+    /// # Errors
+    /// A name in the parameters is not a ROS name, or the middleware refuses.
+    pub fn new(
         node: &Node,
-        parameters: &Driver,
+        parameters: &DriverParameters,
         work_cell: &WorkCell,
-    ) -> anyhow::Result<Self> {
+    ) -> Result<Self, NodeError> {
         let origin = Instant::now();
         let tasks = node.task_group();
         Ok(Self {
@@ -95,7 +100,7 @@ impl DriverClient {
     }
 
     /// What the driver was found to lack.
-    pub(crate) fn refusal(&self) -> Option<String> {
+    pub fn refusal(&self) -> Option<String> {
         match &*self.readiness.borrow() {
             Readiness::Refused(reason) => Some(reason.clone()),
             Readiness::Ready | Readiness::Unchecked(_) => None,
@@ -111,7 +116,7 @@ impl DriverClient {
     }
 
     /// The same, and what the driver was found to lack, or that it is not known yet.
-    pub(crate) fn unready(&self) -> Option<String> {
+    pub fn unready(&self) -> Option<String> {
         self.obstacle()
             .or_else(|| self.readiness.borrow().obstacle())
     }

@@ -15,13 +15,13 @@ use tokio_util::sync::CancellationToken;
 use tracing::debug;
 use ur5::{JointTrajectory, Joints};
 
-use super::readiness::Readiness;
-use super::{DriverClient, DriverError};
-use crate::parameters::ContactSign;
+use crate::ContactSign;
+use crate::readiness::Readiness;
 use crate::status::DriverStatus;
+use crate::{DriverClient, DriverError};
 
 /// The robot for one primitive. Its methods block: not for the runtime's own threads.
-pub(crate) struct DriverRobot {
+pub struct DriverRobot {
     client: Arc<DriverClient>,
     runtime: Handle,
     stop: CancellationToken,
@@ -30,11 +30,12 @@ pub(crate) struct DriverRobot {
     /// Stamp of the joint reading before the motion whose end has not been read yet.
     left: Option<Duration>,
     /// Stamps of the first and the last joint reading.
-    pub(crate) stamps: Option<(Duration, Duration)>,
+    pub stamps: Option<(Duration, Duration)>,
 }
 
 impl DriverRobot {
-    pub(crate) fn new(client: Arc<DriverClient>, runtime: Handle, stop: CancellationToken) -> Self {
+    /// For one primitive, which begins now; `stop` ends its motions.
+    pub fn new(client: Arc<DriverClient>, runtime: Handle, stop: CancellationToken) -> Self {
         Self {
             begun: client.origin.elapsed(),
             client,

@@ -13,9 +13,9 @@ use tokio::time::{MissedTickBehavior, interval, sleep, timeout};
 use tokio_util::sync::CancellationToken;
 use tracing::{debug, info, warn};
 
-use super::{DriverClient, DriverError};
-use crate::parameters::{ContactSign, Driver};
 use crate::planted::{Planted, is_planted};
+use crate::{ContactSign, DriverParameters};
+use crate::{DriverClient, DriverError};
 
 /// How often a motion is looked after.
 const WATCH_PERIOD: Duration = Duration::from_millis(20);
@@ -29,7 +29,7 @@ impl DriverClient {
     ///
     /// # Errors
     /// The motion was broken off; the arm rests, or the error says that it may still be moving.
-    pub(super) async fn carry_out<A: Action + 'static>(
+    pub(crate) async fn carry_out<A: Action + 'static>(
         &self,
         client: &Arc<ActionClient<A>>,
         goal: A::Goal,
@@ -111,7 +111,7 @@ impl DriverClient {
     }
 
     /// Breaks a motion off. Returns the reason, with what could not be made sure of.
-    pub(super) async fn break_off(&self, reason: DriverError) -> DriverError {
+    pub(crate) async fn break_off(&self, reason: DriverError) -> DriverError {
         if is_planted(Planted::AnswersWithoutCancel) {
             return reason;
         }
@@ -128,7 +128,7 @@ impl DriverClient {
     ///
     /// # Errors
     /// The arm was not seen to come to rest.
-    pub(super) async fn stop_arm(&self) -> Result<(), String> {
+    pub(crate) async fn stop_arm(&self) -> Result<(), String> {
         let called = self.origin.elapsed();
         let limit = Duration::from_secs_f64(self.parameters.stop_timeout_s);
         let mut status = self.status.clone();
@@ -178,7 +178,7 @@ impl DriverClient {
 
     /// Waits for a reason to break a motion off.
     async fn trouble(&self, planned: Duration, stop: &CancellationToken) -> DriverError {
-        let Driver {
+        let DriverParameters {
             motion_time_factor,
             motion_time_margin_s,
             ..

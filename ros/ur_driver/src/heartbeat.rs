@@ -3,7 +3,7 @@
 use std::time::Duration;
 
 use msgs::std_msgs::Bool;
-use node_kit::{Node, Publisher, Qos, TaskGroup};
+use node_kit::{Node, NodeError, Publisher, Qos, TaskGroup};
 use tokio::sync::watch;
 use tokio::time::timeout;
 
@@ -29,14 +29,14 @@ struct Beating {
 }
 
 /// Says on a topic what this executor is at.
-pub(crate) struct Heartbeat {
+pub struct Heartbeat {
     beating: watch::Sender<Beating>,
     /// Whether the last heartbeat said that a motion is under way.
     said: watch::Receiver<bool>,
 }
 
 /// A motion is under way until this is dropped.
-pub(super) struct Moving(watch::Sender<Beating>);
+pub(crate) struct Moving(watch::Sender<Beating>);
 
 impl Drop for Moving {
     fn drop(&mut self) {
@@ -45,7 +45,7 @@ impl Drop for Moving {
 }
 
 /// The executor is active until this is dropped.
-pub(crate) struct ActiveExecutor(watch::Sender<Beating>);
+pub struct ActiveExecutor(watch::Sender<Beating>);
 
 impl Drop for ActiveExecutor {
     fn drop(&mut self) {
@@ -53,8 +53,21 @@ impl Drop for ActiveExecutor {
     }
 }
 
+/// Why this executor must not move the arm.
+#[derive(Debug, thiserror::Error)]
+pub enum ActivateError {
+    /// The heartbeat of others cannot be heard.
+    #[error(transparent)]
+    Node(#[from] NodeError),
+    /// One executor for each arm.
+    #[error(
+        "another executor is active: its heartbeat is on {TOPIC}, expected one executor for each arm"
+    )]
+    AnotherIsActive,
+}
+
 impl Heartbeat {
-    pub(super) fn new(node: &Node, tasks: &TaskGroup) -> anyhow::Result<Self> {
+    pub(crate) fn new(node: &Node, tasks: &TaskGroup) -> Result<Self, NodeError> {
         let beating = watch::Sender::new(Beating::default());
         let (saying, said) = watch::channel(false);
         let heartbeats = node.publisher::<Bool>(TOPIC, Qos::Event)?;
@@ -63,20 +76,20 @@ impl Heartbeat {
     }
 
     /// A motion begins.
-    pub(super) fn moving(&self) -> Moving {
+    pub(crate) fn moving(&self) -> Moving {
         self.beating.send_modify(|beating| beating.moving += 1);
         Moving(self.beating.clone())
     }
 
     /// Waits until no motion is under way and no goal is unanswered.
-    pub(super) async fn idle(&self) {
+    pub(crate) async fn idle(&self) {
         let mut beating = self.beating.subscribe();
         // The sender lives as long as this.
         let _ = beating.wait_for(|beating| beating.moving == 0).await;
     }
 
     /// The same, and until the watchdog was told so.
-    pub(crate) async fn quiet(&self) {
+    pub async fn quiet(&self) {
         self.idle().await;
         let mut said = self.said.clone();
         // An error: nothing is said any more.
@@ -87,7 +100,7 @@ impl Heartbeat {
     ///
     /// # Errors
     /// Another one is active.
-    pub(crate) async fn activate(&self, node: &Node) -> anyhow::Result<ActiveExecutor> {
+    pub async fn activate(&self, node: &Node) -> Result<ActiveExecutor, ActivateError> {
         let mut heartbeats = node.subscription::<Bool>(TOPIC, Qos::Event)?;
         let listening = async {
             for _ in 0..HEARTBEATS_OF_ANOTHER {
@@ -95,9 +108,7 @@ impl Heartbeat {
             }
         };
         if timeout(LISTENING, listening).await.is_ok() && !is_planted(Planted::SecondExecutor) {
-            anyhow::bail!(
-                "another executor is active: its heartbeat is on {TOPIC}, expected one executor for each arm"
-            );
+            return Err(ActivateError::AnotherIsActive);
         }
         self.beating.send_modify(|beating| beating.active = true);
         Ok(ActiveExecutor(self.beating.clone()))

@@ -28,7 +28,7 @@ struct Bench {
 
 impl Bench {
     /// `hardware`: parameters of the simulated driver.
-    async fn start(hardware: &[(&str, &str)], driver: Driver) -> Self {
+    async fn start(hardware: &[(&str, &str)], driver: DriverParameters) -> Self {
         if let Ok(level) = std::env::var("TEST_LOG_LEVEL") {
             // Once for all tests of the process.
             let _ = node_kit::logging::init(&[level]);
@@ -174,7 +174,7 @@ const LATE: &[(&str, &str)] = &[
 
 #[tokio::test(flavor = "multi_thread")]
 async fn a_descent_that_is_accepted_late_is_carried_out_once() {
-    let bench = Bench::start(LATE, Driver::default()).await;
+    let bench = Bench::start(LATE, DriverParameters::default()).await;
     let descent = bench.over_the_table().await;
     let descended = bench.work(&CancellationToken::new(), move |robot| {
         robot.follow_until_contact(&descent)
@@ -186,7 +186,7 @@ async fn a_descent_that_is_accepted_late_is_carried_out_once() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn a_stop_acts_while_a_descent_is_unanswered_and_what_is_accepted_later_does_not_move() {
-    let bench = Bench::start(LATE, Driver::default()).await;
+    let bench = Bench::start(LATE, DriverParameters::default()).await;
     let descent = bench.over_the_table().await;
     let stop = CancellationToken::new();
     let descended = bench.work(&stop, move |robot| robot.follow_until_contact(&descent));
@@ -208,9 +208,9 @@ async fn a_rejected_goal_cancels_everything_and_the_arm_comes_to_rest() {
         ("inactive_controllers", "[tool_contact_controller]"),
         ("braking_time_s", "0.1"),
     ];
-    let driver = Driver {
+    let driver = DriverParameters {
         check_controllers: false,
-        ..Driver::default()
+        ..DriverParameters::default()
     };
     let bench = Bench::start(&hardware, driver).await;
     let descent = bench.over_the_table().await;
@@ -237,10 +237,10 @@ async fn a_rejected_goal_cancels_everything_and_the_arm_comes_to_rest() {
 #[tokio::test(flavor = "multi_thread")]
 async fn a_tolerance_violation_is_a_fault_and_only_the_lag_rule_makes_it_an_outcome() {
     for lag_rule in [false, true] {
-        let driver = Driver {
+        let driver = DriverParameters {
             path_tolerance_rad: 0.05,
             lag_rule,
-            ..Driver::default()
+            ..DriverParameters::default()
         };
         let hardware = [("servo_delay_s", "0.2"), ("braking_time_s", "0.1")];
         let bench = Bench::start(&hardware, driver).await;
@@ -265,7 +265,7 @@ async fn the_usual_lag_of_a_servo_loop_is_no_violation() {
         ("braking_time_s", "0.1"),
         ("encoder_noise_rad", "2e-5"),
     ];
-    let bench = Bench::start(&hardware, Driver::default()).await;
+    let bench = Bench::start(&hardware, DriverParameters::default()).await;
     // As fast as the arm can.
     let turn = bench.turn(2.0);
     let end = *turn.last();
@@ -279,7 +279,7 @@ async fn the_usual_lag_of_a_servo_loop_is_no_violation() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn a_stop_in_mid_motion_is_told_when_the_arm_rests() {
-    let bench = Bench::start(&[("braking_time_s", "0.15")], Driver::default()).await;
+    let bench = Bench::start(&[("braking_time_s", "0.15")], DriverParameters::default()).await;
     let turn = bench.turn(2.0);
     let stop = CancellationToken::new();
     let moved = bench.work(&stop, move |robot| robot.follow(&turn));
@@ -295,7 +295,7 @@ async fn a_stop_in_mid_motion_is_told_when_the_arm_rests() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn a_motion_that_is_stopped_because_the_node_ends_is_watched_until_the_arm_rests() {
-    let bench = Bench::start(&[("braking_time_s", "0.15")], Driver::default()).await;
+    let bench = Bench::start(&[("braking_time_s", "0.15")], DriverParameters::default()).await;
     let turn = bench.turn(2.0);
     let stop = CancellationToken::new();
     let moved = bench.work(&stop, move |robot| robot.follow(&turn));
@@ -315,7 +315,7 @@ async fn a_motion_that_is_stopped_because_the_node_ends_is_watched_until_the_arm
 
 #[tokio::test(flavor = "multi_thread")]
 async fn no_motion_begins_before_it_is_known_what_became_of_the_last_goal() {
-    let bench = Bench::start(LATE, Driver::default()).await;
+    let bench = Bench::start(LATE, DriverParameters::default()).await;
     let descent = bench.over_the_table().await;
     let stop = CancellationToken::new();
     let descended = bench.work(&stop, move |robot| robot.follow_until_contact(&descent));
@@ -338,9 +338,9 @@ async fn every_fault_of_the_robot_ends_a_motion_with_its_name() {
         ("program_stopped", "program is not running"),
         ("driver_dead", "expected at most 0.3 s"),
     ] {
-        let driver = Driver {
+        let driver = DriverParameters {
             status_max_age_s: 0.3,
-            ..Driver::default()
+            ..DriverParameters::default()
         };
         let hardware = [("braking_time_s", "0.1"), ("speed_scaling", "0.2")];
         let bench = Bench::start(&hardware, driver).await;
@@ -373,22 +373,26 @@ async fn what_the_driver_lacks_is_refused_by_name() {
                 "inactive_controllers",
                 "[scaled_joint_trajectory_controller]",
             ),
-            Driver::default(),
+            DriverParameters::default(),
             "scaled_joint_trajectory_controller",
         ),
         (
             ("inactive_controllers", "[tool_contact_controller]"),
-            Driver::default(),
+            DriverParameters::default(),
             "tool_contact_controller",
         ),
-        (("software_major", "3"), Driver::default(), "software"),
-        (("tool_voltage", "0"), Driver::default(), "pin 16"),
+        (
+            ("software_major", "3"),
+            DriverParameters::default(),
+            "software",
+        ),
+        (("tool_voltage", "0"), DriverParameters::default(), "pin 16"),
         (
             ("tool_voltage", "0"),
-            Driver {
+            DriverParameters {
                 suction_pin: 3,
                 vacuum_pin: 4,
-                ..Driver::default()
+                ..DriverParameters::default()
             },
             "",
         ),
@@ -421,10 +425,10 @@ async fn suction_waits_for_the_vacuum_and_the_release_is_verified() {
         ("vacuum_release_s", "0.2"),
         ("braking_time_s", "0.1"),
     ];
-    let driver = Driver {
+    let driver = DriverParameters {
         grasp_wait_s: 1.0,
         release_wait_s: 1.0,
-        ..Driver::default()
+        ..DriverParameters::default()
     };
     let bench = Bench::start(&hardware, driver).await;
     // Nothing is there to grip: the wait ends, and the sensor says so.

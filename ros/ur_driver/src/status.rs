@@ -178,13 +178,13 @@ fn safety_mode_name(mode: u8) -> String {
 }
 
 #[cfg(test)]
-pub(crate) mod tests {
+mod tests {
     use super::*;
 
     const AGE: Duration = Duration::from_secs(1);
 
     /// A driver that is ready at `now`.
-    pub(crate) fn ready(now: Duration) -> DriverStatus {
+    fn ready(now: Duration) -> DriverStatus {
         let reading = JointReading {
             stamp: Duration::from_secs(5),
             positions_rad: Joints::zeros(),

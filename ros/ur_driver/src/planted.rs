@@ -1,10 +1,9 @@
-//! Faults planted on purpose: `cargo xtask campaign --planted` shows that the monitor of the fault campaign catches each of them. They are
+//! Faults of the executor and of its way to the driver, planted on purpose: `cargo xtask campaign --planted` shows that the monitor of the fault campaign catches each of them. They are
 //! compiled into the executable `suction_executor_planted` only, by the feature `planted_faults`; everywhere else they are constants.
 
 /// A fault of the executor.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-#[cfg_attr(not(feature = "planted_faults"), allow(dead_code))]
-pub(crate) enum Planted {
+pub enum Planted {
     /// A proposal moves without an approval.
     MovesUnapproved,
     /// The approval of any proposal moves the newest one.
@@ -33,29 +32,39 @@ pub(crate) enum Planted {
     SecondExecutor,
 }
 
+/// Names the fault; as [`Planted`] spells it.
+const VARIABLE: &str = "SCTN_PLANTED_FAULT";
+
+/// The environment names no fault, where one has to be planted.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
+#[error("{VARIABLE} names no fault, expected a variant of Planted, such as IgnoresStop")]
+pub struct NoFault;
+
 #[cfg(not(feature = "planted_faults"))]
 mod none {
-    use super::Planted;
+    use super::{NoFault, Planted};
 
-    pub(crate) const fn is_planted(_: Planted) -> bool {
+    /// Whether the fault is planted: never.
+    pub const fn is_planted(_: Planted) -> bool {
         false
     }
 
-    pub(crate) const fn check() -> anyhow::Result<()> {
+    /// Nothing is planted.
+    ///
+    /// # Errors
+    /// None.
+    pub const fn check() -> Result<(), NoFault> {
         Ok(())
     }
 }
 
 #[cfg(not(feature = "planted_faults"))]
-pub(crate) use self::none::{check, is_planted};
+pub use self::none::{check, is_planted};
 
 #[cfg(feature = "planted_faults")]
 mod some {
-    use super::Planted;
+    use super::{NoFault, Planted};
     use std::sync::LazyLock;
-
-    /// Names the fault; as `Planted` spells it.
-    const VARIABLE: &str = "SCTN_PLANTED_FAULT";
 
     const ALL: [Planted; 13] = [
         Planted::MovesUnapproved,
@@ -74,24 +83,23 @@ mod some {
     ];
 
     static PLANTED: LazyLock<Option<Planted>> = LazyLock::new(|| {
-        let name = std::env::var(VARIABLE).ok()?;
+        let name = std::env::var(super::VARIABLE).ok()?;
         ALL.into_iter().find(|fault| format!("{fault:?}") == name)
     });
 
-    pub(crate) fn is_planted(fault: Planted) -> bool {
+    /// Whether the fault is planted.
+    pub fn is_planted(fault: Planted) -> bool {
         *PLANTED == Some(fault)
     }
 
+    /// Whether the environment names a fault.
+    ///
     /// # Errors
     /// No fault is named.
-    pub(crate) fn check() -> anyhow::Result<()> {
-        anyhow::ensure!(
-            PLANTED.is_some(),
-            "{VARIABLE} names no fault, expected one of {ALL:?}"
-        );
-        Ok(())
+    pub fn check() -> Result<(), NoFault> {
+        PLANTED.map(drop).ok_or(NoFault)
     }
 }
 
 #[cfg(feature = "planted_faults")]
-pub(crate) use self::some::{check, is_planted};
+pub use self::some::{check, is_planted};

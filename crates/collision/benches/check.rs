@@ -35,8 +35,8 @@ fn check(criterion: &mut Criterion) {
     }];
     let scene = Scene {
         terrain: Some(&terrain),
-        carried: None,
         contacts,
+        ..Scene::default()
     };
     for (name, trajectory) in [
         ("approach", &approach),

@@ -1,6 +1,7 @@
 //! The check of one motion.
 
 use crate::Terrain;
+use crate::terrain::Column;
 use nalgebra::{Isometry3, Point2, Point3, Vector3};
 use parry3d::math::{Pose, Rotation, Vector};
 use parry3d::shape::{Ball, Cuboid, Cylinder};
@@ -12,6 +13,9 @@ use ur5::{Arm, Body, JointTrajectory, Joints, Shape, WorkCell, joints_text};
 pub struct Margins {
     /// From everything fixed and from the heightmap.
     pub obstacle_m: f64,
+    /// Of tool and carried object from the heightmap while the tip is slow: no faster than 0.2 m/s on its whole way. Work between things that
+    /// stand close together is slow, and a slow arm is where it should be.
+    pub slow_m: f64,
     /// Between links that are not neighbours, and between a link and the carried object.
     pub self_m: f64,
 }
@@ -20,6 +24,7 @@ impl Default for Margins {
     fn default() -> Self {
         Self {
             obstacle_m: 0.01,
+            slow_m: 0.003,
             self_m: 0.004,
         }
     }
@@ -43,6 +48,9 @@ pub struct Carried {
     pub shape: Shape,
     /// Pose of the shape in the frame of the suction tip (z points out of the tool).
     pub tip_from_shape: Isometry3<f64>,
+    /// Whether it is the part at the cup of something long and thin, a cable: it yields to what it meets on the table, so that the heightmap is no
+    /// obstacle to it.
+    pub yields: bool,
 }
 
 impl Carried {
@@ -70,6 +78,8 @@ pub struct Scene<'a> {
     pub terrain: Option<&'a Terrain>,
     /// What the gripper holds.
     pub carried: Option<Carried>,
+    /// What stands in the way of what is carried, where that is not the whole terrain.
+    pub carried_terrain: Option<&'a Terrain>,
     /// Where contact is wanted.
     pub contacts: Vec<Contact>,
 }
@@ -106,10 +116,16 @@ pub struct Collision {
 
 /// Between samples nothing moves further than this, or than the distance left.
 const RESOLUTION_M: f64 = 0.002;
+/// A tip that is nowhere faster is slow.
+const SLOW_M_S: f64 = 0.2;
+/// Speeds are looked at in steps of this time.
+const SPEED_TICK: Duration = Duration::from_millis(20);
 /// Motions are looked at in steps of this time to know how far they go.
 const TICK: Duration = Duration::from_micros(500);
 /// Distances of more than this over the margin need not be known exactly.
 const FAR_M: f64 = 0.05;
+/// The same for the heightmap.
+const LOOK_M: f64 = 0.02;
 /// Columns of the heightmap reach down to here.
 const BOTTOM_M: f64 = -0.05;
 /// The link that carries the gripper.
@@ -147,6 +163,7 @@ impl CollisionChecker {
     pub fn new(cell: &WorkCell, margins: Margins) -> Result<Self, MarginsError> {
         for (name, value_m) in [
             ("the margin to obstacles", margins.obstacle_m),
+            ("the margin of slow motions", margins.slow_m),
             ("the margin between links", margins.self_m),
         ] {
             if !(0.0..=MOST_M).contains(&value_m) {
@@ -233,12 +250,16 @@ impl CollisionChecker {
         };
         let end = trajectory.duration();
         let mut sampler = trajectory.sampler();
+        let near_m = match self.is_slow(trajectory) {
+            true => self.margins.slow_m,
+            false => self.margins.obstacle_m,
+        };
         let mut clearance = Clearance {
             least_m: f64::INFINITY,
             samples: 0,
         };
         let mut last = sampler.state(Duration::ZERO).positions_rad;
-        let mut left_m = self.sample(&last, Duration::ZERO, scene, &mut clearance)?;
+        let mut left_m = self.sample(&last, Duration::ZERO, scene, near_m, &mut clearance)?;
         let mut previous = (Duration::ZERO, last);
         let mut time = Duration::ZERO;
         while time < end {
@@ -251,27 +272,49 @@ impl CollisionChecker {
                 } else {
                     previous
                 };
-                left_m = self.sample(&sampled, at, scene, &mut clearance)?;
+                left_m = self.sample(&sampled, at, scene, near_m, &mut clearance)?;
                 last = sampled;
                 if moved_m(&last, &joints) > left_m.max(RESOLUTION_M) {
-                    left_m = self.sample(&joints, time, scene, &mut clearance)?;
+                    left_m = self.sample(&joints, time, scene, near_m, &mut clearance)?;
                     last = joints;
                 }
             }
             previous = (time, joints);
         }
         if previous.1 != last {
-            self.sample(&previous.1, previous.0, scene, &mut clearance)?;
+            self.sample(&previous.1, previous.0, scene, near_m, &mut clearance)?;
         }
         Ok(clearance)
     }
 
-    /// Checks one joint position; how far everything is from its margin.
+    /// Whether the tip is nowhere faster than [`SLOW_M_S`].
+    fn is_slow(&self, trajectory: &JointTrajectory) -> bool {
+        let mut sampler = trajectory.sampler();
+        let mut tip_m = |time| {
+            let joints = sampler.state(time).positions_rad;
+            self.arm.tip(&joints).translation.vector
+        };
+        let mut before = (Duration::ZERO, tip_m(Duration::ZERO));
+        while before.0 < trajectory.duration() {
+            let time = (before.0 + SPEED_TICK).min(trajectory.duration());
+            let here_m = tip_m(time);
+            // A little more for rounding.
+            let most_m = 1.001 * SLOW_M_S * (time - before.0).as_secs_f64();
+            if (here_m - before.1).norm() > most_m {
+                return false;
+            }
+            before = (time, here_m);
+        }
+        true
+    }
+
+    /// Checks one joint position; how far everything is from its margin. `near_m`: the margin of tool and carried object from the heightmap.
     fn sample(
         &self,
         joints: &Joints,
         time: Duration,
         scene: &Scene<'_>,
+        near_m: f64,
         clearance: &mut Clearance,
     ) -> Result<f64, Box<Collision>> {
         clearance.samples += 1;
@@ -347,18 +390,35 @@ impl CollisionChecker {
                     ));
                 }
             }
-            let margin_m = self.margins.obstacle_m;
-            if let Some(terrain) = scene.terrain {
-                let (distance_m, at) =
-                    terrain_distance_m(part, &pose, terrain, margin_m, |at, height_m| {
-                        (touches || part.carrier == Some(TOOL))
-                            && scene.contacts.iter().any(|contact| {
-                                (at - contact.center_m).norm() <= contact.radius_m
-                                    && (touches || height_m <= contact.up_to_m)
-                            })
-                    });
+            let yields = touches && scene.carried.is_some_and(|carried| carried.yields);
+            let terrain = match touches {
+                true => scene.carried_terrain.or(scene.terrain),
+                false => scene.terrain,
+            };
+            if let Some(terrain) = terrain.filter(|_| !yields) {
+                let most_m = self.margins.obstacle_m.max(self.margins.slow_m);
+                let is_tool = touches || part.carrier == Some(TOOL);
+                let found = terrain_clearance(part, &pose, terrain, most_m, |at, height_m| {
+                    if !is_tool {
+                        return Some(self.margins.obstacle_m);
+                    }
+                    let mut here = scene
+                        .contacts
+                        .iter()
+                        .filter(|contact| (at - contact.center_m).norm() <= contact.radius_m)
+                        .peekable();
+                    // Beside a contact the tool goes straight down or up.
+                    let margin_m = match here.peek() {
+                        Some(_) => near_m.min(self.margins.slow_m),
+                        None => near_m,
+                    };
+                    let touch = here.any(|contact| touches || height_m <= contact.up_to_m);
+                    (!touch).then_some(margin_m)
+                });
+                let (distance_m, margin_m) = (found.distance_m, found.margin_m);
                 if !count(distance_m, margin_m) {
-                    let obstacle = format!("the heightmap at ({:.3}, {:.3})", at.x, at.y);
+                    let (x, y) = (found.at.x, found.at.y);
+                    let obstacle = format!("the heightmap at ({x:.3}, {y:.3})");
                     return Err(collision(&part.link, obstacle, distance_m, margin_m));
                 }
             }
@@ -469,54 +529,93 @@ fn prepared(pose: &Isometry3<f64>, shape: &Shape) -> (Pose, Prepared) {
     )
 }
 
-/// Distance of a part from the columns of the terrain that are not left out, up to [`FAR_M`] over the margin, and where.
-fn terrain_distance_m(
+/// How near a part is to a terrain.
+struct TerrainClearance {
+    distance_m: f64,
+    margin_m: f64,
+    /// Where the terrain is nearest its margin.
+    at: Point2<f64>,
+}
+
+impl TerrainClearance {
+    fn left_m(&self) -> f64 {
+        self.distance_m - self.margin_m
+    }
+}
+
+/// Where the columns of a terrain leave a part the least over the margin that each has, which is `most_m` or less. Columns without a margin are left
+/// out; what leaves more than [`LOOK_M`] is not looked at.
+fn terrain_clearance(
     part: &Part,
     pose: &Isometry3<f64>,
     terrain: &Terrain,
-    margin_m: f64,
-    is_left_out: impl Fn(Point2<f64>, f64) -> bool,
-) -> (f64, Point2<f64>) {
+    most_m: f64,
+    margin_m: impl Fn(Point2<f64>, f64) -> Option<f64>,
+) -> TerrainClearance {
     let center = pose.translation.vector;
-    let look_m = margin_m + 0.4 * FAR_M;
     let extent = Vector3::from_fn(|axis, _| {
         let along = pose.inverse_transform_vector(&Vector3::ith(axis, 1.0));
         part.shape.extent_m(&along)
     });
     let lowest_m = center.z - extent.z;
+    let far = |distance_m| TerrainClearance {
+        distance_m,
+        margin_m: 0.0,
+        at: Point2::from(center.xy()),
+    };
     let over_all_m = lowest_m - terrain.highest_m();
-    let nowhere = Point2::from(center.xy());
-    if over_all_m > look_m {
-        return (over_all_m, nowhere);
+    if over_all_m > most_m + LOOK_M {
+        return far(over_all_m - most_m);
     }
-    let around = extent.xy().add_scalar(look_m);
-    let half_m = 0.5 * terrain.size_m;
-    let mut nearest = (look_m, nowhere);
-    for (at, height_m) in terrain.columns(nowhere - around, nowhere + around) {
-        let beside = (at.coords - center.xy()).abs() - extent.xy();
-        let beside = beside.add_scalar(-half_m).sup(&nalgebra::Vector2::zeros());
-        let above_m = (lowest_m - height_m).max(0.0);
-        if beside.norm().hypot(above_m) >= nearest.0 || is_left_out(at, height_m) {
-            continue;
-        }
-        let length_m = (height_m - BOTTOM_M).max(1e-3);
-        let column = Part {
-            link: String::new(),
-            carrier: None,
-            pose: Isometry3::identity(),
-            shape: Shape::Cuboid {
-                size_m: Vector3::new(terrain.size_m, terrain.size_m, length_m),
-            },
-            radius_m: 0.0,
-        };
-        let column_pose = Isometry3::translation(at.x, at.y, height_m - 0.5 * length_m);
-        let distance_m = exact_distance_m((part, pose), (&column, &column_pose));
-        if distance_m < nearest.0 {
-            nearest = (distance_m, at);
-            if distance_m == 0.0 {
-                break;
+    let look_at = |columns: &mut dyn Iterator<Item = Column>| {
+        let mut nearest = far(LOOK_M);
+        for Column {
+            at,
+            size_m,
+            height_m,
+        } in columns
+        {
+            let beside = (at.coords - center.xy()).abs() - extent.xy();
+            let beside = beside
+                .add_scalar(-0.5 * size_m)
+                .sup(&nalgebra::Vector2::zeros());
+            let above_m = (lowest_m - height_m).max(0.0);
+            let bound_m = beside.norm().hypot(above_m);
+            if bound_m - most_m >= nearest.left_m() {
+                continue;
+            }
+            let Some(margin_m) = margin_m(at, height_m) else {
+                continue;
+            };
+            let length_m = (height_m - BOTTOM_M).max(1e-3);
+            let column = Part {
+                link: String::new(),
+                carrier: None,
+                pose: Isometry3::identity(),
+                shape: Shape::Cuboid {
+                    size_m: Vector3::new(size_m, size_m, length_m),
+                },
+                radius_m: 0.0,
+            };
+            let column_pose = Isometry3::translation(at.x, at.y, height_m - 0.5 * length_m);
+            let distance_m = exact_distance_m((part, pose), (&column, &column_pose));
+            if distance_m - margin_m < nearest.left_m() {
+                nearest = TerrainClearance {
+                    distance_m,
+                    margin_m,
+                    at,
+                };
             }
         }
+        nearest
+    };
+    let around = extent.xy().add_scalar(most_m + LOOK_M);
+    let middle = Point2::from(center.xy());
+    let (low, high) = (middle - around, middle + around);
+    let nearest = look_at(&mut terrain.columns(low, high));
+    if nearest.left_m() >= 0.0 {
+        return nearest;
     }
-    nearest
+    // Too near by the columns, which are wider than what was seen: by its cells.
+    look_at(&mut terrain.cells(low, high))
 }

@@ -5,15 +5,22 @@ use heightmap::Heightmap;
 use nalgebra::{Isometry3, Point2, Point3, Translation3, Vector3};
 use ur5::Shape;
 
-/// A cell belongs to the object if its height differs by less from a neighbour's that does.
+/// A cell belongs to the object if its height differs by less from that of a neighbour that does.
 const STEP_M: f32 = 0.006;
+/// It also does where its height differs by less from that of the pick: beads of a cable have gaps.
+const LEVEL_M: f32 = 0.008;
 /// Cells further from the pick belong to something else, the table for instance.
 const REACH_M: f64 = 0.15;
 /// How far from its axis the cup holds a part of something larger.
 const AT_THE_CUP_M: f64 = 0.02;
+/// What is nowhere wider than twice this is thin.
+const THIN_M: f64 = 0.02;
 
 /// The object under a pick and the heightmap without it. `tip` is the pose of the suction tip at the contact: the box is fixed to it. Where it
 /// stood the heightmap is as high as the highest of the lower cells around it.
+///
+/// Of something longer than 0.15 m only what is within 20 mm of the cup is lifted out; where it is thin as well, that counts as a part of a cable, which
+/// yields.
 ///
 /// None when the pick lies outside the heightmap.
 pub fn lift_out(heightmap: &Heightmap, tip: &Isometry3<f64>) -> Option<(Carried, Heightmap)> {
@@ -28,6 +35,11 @@ pub fn lift_out(heightmap: &Heightmap, tip: &Isometry3<f64>) -> Option<(Carried,
             col: index % cols,
         })
     };
+    // Where the pick stands out, what is as low as the ground is no part of it: the sides of a cable may seem to slope.
+    let ground_m = ground_m(heightmap, |index| (center(index) - pick).norm() < REACH_M);
+    let stands_out = heightmap.height_m[start] > ground_m + STEP_M;
+    let is_ground =
+        |index: usize| stands_out && heightmap.height_m[index] < ground_m + 0.5 * STEP_M;
     let mut member = vec![false; workspace.len()];
     member[start] = true;
     let (mut object, mut border, mut next) = (vec![start], Vec::new(), 0);
@@ -50,7 +62,9 @@ pub fn lift_out(heightmap: &Heightmap, tip: &Isometry3<f64>) -> Option<(Carried,
                 continue;
             }
             let step_m = (heightmap.height_m[side] - heightmap.height_m[index]).abs();
-            if step_m < STEP_M && (center(side) - pick).norm() < REACH_M {
+            let level_m = (heightmap.height_m[side] - heightmap.height_m[start]).abs();
+            let belongs = step_m < STEP_M || stands_out && level_m < LEVEL_M;
+            if belongs && !is_ground(side) && (center(side) - pick).norm() < REACH_M {
                 member[side] = true;
                 object.push(side);
             } else {
@@ -59,10 +73,17 @@ pub fn lift_out(heightmap: &Heightmap, tip: &Isometry3<f64>) -> Option<(Carried,
         }
     }
     // No step sets it apart from what is around it: a cable, or something as flat as the table's noise. What hangs at the cup counts.
-    if object
+    let goes_on = object
         .iter()
-        .any(|index| (center(*index) - pick).norm() > REACH_M - 2.0 * workspace.pixel_size_m)
-    {
+        .any(|index| (center(*index) - pick).norm() > REACH_M - 2.0 * workspace.pixel_size_m);
+    let yields = goes_on
+        && is_thin(
+            &object,
+            &member,
+            (rows, cols),
+            THIN_M / workspace.pixel_size_m,
+        );
+    if goes_on {
         object.retain(|index| (center(*index) - pick).norm() < AT_THE_CUP_M);
         border.clear();
     }
@@ -106,8 +127,42 @@ pub fn lift_out(heightmap: &Heightmap, tip: &Isometry3<f64>) -> Option<(Carried,
             Translation3::from(0.5 * (low + high)),
             nalgebra::UnitQuaternion::identity(),
         ),
+        yields,
     };
     Some((carried, rest))
+}
+
+/// Height of the ground: most of the seen cells among some are higher than the lowest tenth of them.
+fn ground_m(heightmap: &Heightmap, among: impl Fn(usize) -> bool) -> f32 {
+    let seen = (0..heightmap.height_m.len()).filter(|index| heightmap.is_seen(*index));
+    let mut heights_m: Vec<f32> = seen
+        .filter(|index| among(*index))
+        .map(|index| heightmap.height_m[index])
+        .collect();
+    heights_m.sort_by(f32::total_cmp);
+    heights_m.get(heights_m.len() / 10).copied().unwrap_or(0.0)
+}
+
+/// Whether every cell of an object has a cell beside the object within so many cells.
+fn is_thin(object: &[usize], member: &[bool], (rows, cols): (usize, usize), within: f64) -> bool {
+    let steps = within.ceil() as isize;
+    let offsets: Vec<(isize, isize)> = (-steps..=steps)
+        .flat_map(|row| (-steps..=steps).map(move |col| (row, col)))
+        .filter(|(row, col)| (*row as f64).hypot(*col as f64) <= within)
+        .collect();
+    object.iter().all(|index| {
+        let (row, col) = (index / cols, index % cols);
+        offsets.iter().any(|(down, right)| {
+            let near = (
+                row.checked_add_signed(*down),
+                col.checked_add_signed(*right),
+            );
+            let (Some(row), Some(col)) = near else {
+                return false;
+            };
+            row < rows && col < cols && !member[row * cols + col]
+        })
+    })
 }
 
 #[cfg(test)]
@@ -143,7 +198,47 @@ mod tests {
         assert!((size_m - expected).amax() < 1e-6, "{size_m} {expected}");
         // Below the tip, whose z points down.
         assert!((carried.tip_from_shape.translation.z - 0.015).abs() < 1e-6);
+        assert!(!carried.yields);
         let outside = Arm::tip_down(&Isometry2::translation(2.0, 0.0), 0.0);
         assert!(lift_out(&heightmap, &outside).is_none());
+    }
+
+    #[test]
+    fn only_something_long_and_thin_yields() {
+        let strip = |rows: std::ops::Range<usize>, cols: std::ops::Range<usize>| {
+            let rows_of_sides = if cols.start == 78 { rows.clone() } else { 0..0 };
+            let mut heightmap = Heightmap::new(Workspace::RAVENS);
+            heightmap.rgb.fill(100);
+            for row in rows {
+                heightmap.height_m[row * 160 + cols.start..row * 160 + cols.end].fill(0.012);
+            }
+            // Sides that seem to slope, and gaps.
+            for row in rows_of_sides {
+                heightmap.height_m[row * 160 + 77] = 0.005;
+                if row % 5 == 0 {
+                    heightmap.height_m[row * 160 + 77..row * 160 + 82].fill(0.0055);
+                }
+            }
+            let at = heightmap.workspace.point_m(&Point2::new(80.0, 160.0));
+            lift_out(
+                &heightmap,
+                &Arm::tip_down(&Isometry2::translation(at.x, at.y), 0.012),
+            )
+            .unwrap()
+        };
+        // A cable of 12 mm, 0.5 m long.
+        let (cable, rest) = strip(80..240, 78..82);
+        assert!(cable.yields && cable.radius_m() < 0.04, "{cable:?}");
+        // Most of it still lies there.
+        assert_eq!(rest.height_m[160 * 160 + 80], 0.0);
+        assert_eq!(rest.height_m[180 * 160 + 80], 0.012);
+        // A stick of 0.1 m, and a sheet.
+        let (stick, _) = strip(144..176, 78..82);
+        assert!(!stick.yields && stick.radius_m() > 0.04, "{stick:?}");
+        let (sheet, _) = strip(80..240, 60..100);
+        assert!(!sheet.yields, "{sheet:?}");
+        // The bare table.
+        let (nothing, _) = strip(0..0, 0..0);
+        assert!(!nothing.yields, "{nothing:?}");
     }
 }

@@ -10,11 +10,28 @@ const BLOCK: usize = 2;
 #[derive(Clone, Debug, PartialEq)]
 pub struct Terrain {
     origin_m: Point2<f64>,
-    pub(crate) size_m: f64,
+    columns: Grid,
+    cells: Grid,
+    highest_m: f32,
+}
+
+/// Squares side by side, each with a height.
+#[derive(Clone, Debug, PartialEq)]
+struct Grid {
+    size_m: f64,
     rows: usize,
     cols: usize,
     height_m: Vec<f32>,
-    highest_m: f32,
+}
+
+/// A solid column.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub(crate) struct Column {
+    /// Middle of its square.
+    pub at: Point2<f64>,
+    /// Edge of its square.
+    pub size_m: f64,
+    pub height_m: f64,
 }
 
 impl Terrain {
@@ -23,24 +40,30 @@ impl Terrain {
     pub fn new(heightmap: &Heightmap) -> Self {
         let heights_m = filled(heightmap);
         let workspace = &heightmap.workspace;
-        let (rows, cols) = (
-            workspace.rows.div_ceil(BLOCK),
-            workspace.cols.div_ceil(BLOCK),
-        );
+        let cells = Grid {
+            size_m: workspace.pixel_size_m,
+            rows: workspace.rows,
+            cols: workspace.cols,
+            height_m: heights_m,
+        };
+        let (rows, cols) = (cells.rows.div_ceil(BLOCK), cells.cols.div_ceil(BLOCK));
         let mut height_m = vec![0.0f32; rows * cols];
-        for row in 0..workspace.rows {
-            for col in 0..workspace.cols {
+        for row in 0..cells.rows {
+            for col in 0..cells.cols {
                 let block = &mut height_m[row / BLOCK * cols + col / BLOCK];
-                *block = block.max(heights_m[row * workspace.cols + col]);
+                *block = block.max(cells.height_m[row * cells.cols + col]);
             }
         }
         Self {
             origin_m: workspace.origin_m,
-            size_m: BLOCK as f64 * workspace.pixel_size_m,
-            rows,
-            cols,
             highest_m: height_m.iter().copied().fold(0.0, f32::max),
-            height_m,
+            columns: Grid {
+                size_m: BLOCK as f64 * workspace.pixel_size_m,
+                rows,
+                cols,
+                height_m,
+            },
+            cells,
         }
     }
 
@@ -49,25 +72,50 @@ impl Terrain {
         f64::from(self.highest_m)
     }
 
-    /// Centres and heights of the columns that reach into a rectangle.
+    /// The columns that reach into a rectangle.
     pub(crate) fn columns(
         &self,
         low: Point2<f64>,
         high: Point2<f64>,
-    ) -> impl Iterator<Item = (Point2<f64>, f64)> {
+    ) -> impl Iterator<Item = Column> {
+        self.columns.within(self.origin_m, low, high)
+    }
+
+    /// The cells that reach into a rectangle, as high as seen.
+    pub(crate) fn cells(
+        &self,
+        low: Point2<f64>,
+        high: Point2<f64>,
+    ) -> impl Iterator<Item = Column> {
+        self.cells.within(self.origin_m, low, high)
+    }
+}
+
+impl Grid {
+    fn within(
+        &self,
+        origin_m: Point2<f64>,
+        low: Point2<f64>,
+        high: Point2<f64>,
+    ) -> impl Iterator<Item = Column> {
+        let size_m = self.size_m;
         let range = |from: f64, to: f64, count: usize| {
             // Casts clamp, and take what is not a number for 0.
-            let first = (from / self.size_m).floor().max(0.0) as usize;
-            let last = (to / self.size_m).floor() + 1.0;
+            let first = (from / size_m).floor().max(0.0) as usize;
+            let last = (to / size_m).floor() + 1.0;
             first..(last.max(0.0) as usize).min(count)
         };
-        let (low, high) = (low - self.origin_m, high - self.origin_m);
+        let (low, high) = (low - origin_m, high - origin_m);
         let cols = range(low.x, high.x, self.cols);
         range(low.y, high.y, self.rows).flat_map(move |row| {
             cols.clone().map(move |col| {
-                let at = nalgebra::Vector2::new(col as f64 + 0.5, row as f64 + 0.5) * self.size_m;
+                let at = nalgebra::Vector2::new(col as f64 + 0.5, row as f64 + 0.5) * size_m;
                 let height_m = f64::from(self.height_m[row * self.cols + col]);
-                (self.origin_m + at, height_m)
+                Column {
+                    at: origin_m + at,
+                    size_m,
+                    height_m,
+                }
             })
         })
     }
@@ -125,10 +173,15 @@ mod tests {
         }
         let terrain = Terrain::new(&heightmap);
         assert_eq!(terrain.highest_m(), f64::from(0.05f32));
+        // A cell is no wider than it is.
+        let cell = |row: usize, col: usize| {
+            let at = heightmap.workspace.center(heightmap::Pixel { row, col });
+            terrain.cells(at, at).next().unwrap().height_m as f32
+        };
+        assert_eq!((cell(10, 20), cell(10, 19), cell(11, 20)), (0.05, 0.0, 0.0));
         let height = |row: usize, col: usize| {
             let at = heightmap.workspace.center(heightmap::Pixel { row, col });
-            let (_, height_m) = terrain.columns(at, at).next().unwrap();
-            height_m as f32
+            terrain.columns(at, at).next().unwrap().height_m as f32
         };
         assert_eq!(height(11, 21), 0.05);
         // The far corner of the shadow lies beside the bare table.

@@ -101,9 +101,10 @@ proptest! {
             let carried = holds.then_some(Carried {
                 shape: Shape::Cuboid { size_m: Vector3::new(0.04, 0.04, 0.02) },
                 tip_from_shape: Isometry3::translation(0.0, 0.0, 0.01),
+                yields: false,
             });
             let contacts = contacts(&cell.arm, motion, 0.06);
-            let scene = Scene { terrain: Some(&terrain), carried, contacts };
+            let scene = Scene { terrain: Some(&terrain), carried, contacts, ..Scene::default() };
             let passed = checker.check(motion, &scene);
             prop_assert!(passed.is_ok(), "{}", passed.unwrap_err());
         }
@@ -185,7 +186,7 @@ proptest! {
         let Ok(from) = from else { return Ok(()) };
         let way = JointTrajectory::joint_space(arm, &from, &Joints::from(to)).unwrap();
         let check = |obstacle_m, self_m| {
-            let margins = Margins { obstacle_m, self_m };
+            let margins = Margins { obstacle_m, self_m, ..Margins::default() };
             CollisionChecker::new(&cell, margins).unwrap().check(&way, &Scene::default()).is_ok()
         };
         prop_assert!(!check(wide, 0.004) || check(0.005, 0.0));
@@ -262,11 +263,13 @@ fn what_is_carried_counts_and_contact_is_allowed_only_where_it_is_wanted() {
             size_m: Vector3::new(0.03, 0.03, 0.05),
         },
         tip_from_shape: Isometry3::translation(0.0, 0.0, 0.025),
+        yields: false,
     };
     let scene = |carried, contacts| Scene {
         terrain: Some(&terrain),
         carried,
         contacts,
+        ..Scene::default()
     };
     checker.check(&line, &scene(None, vec![])).unwrap();
     let collision = checker
@@ -311,6 +314,55 @@ fn what_is_carried_counts_and_contact_is_allowed_only_where_it_is_wanted() {
 }
 
 #[test]
+fn a_slow_tool_passes_closer_to_what_stands_on_the_table_than_a_fast_one() {
+    let cell = cell();
+    let checker = checker(&cell);
+    let arm = &cell.arm;
+    let over = |y_m: f64| Arm::tip_down(&Isometry2::translation(0.5, y_m), 0.05);
+    let from = arm.solve(&over(-0.2), &arm.ready).unwrap();
+    let check = |gap_m: f64, speed_m_s: f64| {
+        let line = JointTrajectory::line(arm, &from, &over(0.2), speed_m_s, 1.0).unwrap();
+        // A wall beside the way of the cup, whose radius is 10 mm.
+        let mut heightmap = empty_table();
+        let first = heightmap
+            .workspace
+            .pixel(&Point2::new(0.5 + 0.01 + gap_m, 0.0))
+            .unwrap();
+        for row in 0..320 {
+            heightmap.height_m[row * 160 + first.col..row * 160 + 160].fill(0.06);
+        }
+        let terrain = Terrain::new(&heightmap);
+        let found = checker.check(
+            &line,
+            &Scene {
+                terrain: Some(&terrain),
+                ..Scene::default()
+            },
+        );
+        found.map(|found| found.least_m)
+    };
+    // Cells are 3 mm wide.
+    for (gap_m, slow, fast) in [
+        (0.002, false, false),
+        (0.009, true, false),
+        (0.016, true, true),
+    ] {
+        assert_eq!(
+            check(gap_m, 0.15).is_ok(),
+            slow,
+            "{gap_m}: {:?}",
+            check(gap_m, 0.15)
+        );
+        assert_eq!(
+            check(gap_m, 0.5).is_ok(),
+            fast,
+            "{gap_m}: {:?}",
+            check(gap_m, 0.5)
+        );
+    }
+}
+
+#[test]
 fn the_arm_does_not_fold_into_itself() {
     let mut cell = cell();
     // Its hand would touch that first.
@@ -336,9 +388,16 @@ fn margins_without_sense_are_refused_by_name() {
         (f64::NAN, 0.0, "obstacles"),
         (0.01, 0.5, "links"),
     ] {
-        let error = CollisionChecker::new(&cell, Margins { obstacle_m, self_m })
-            .unwrap_err()
-            .to_string();
+        let error = CollisionChecker::new(
+            &cell,
+            Margins {
+                obstacle_m,
+                self_m,
+                ..Margins::default()
+            },
+        )
+        .unwrap_err()
+        .to_string();
         assert!(error.contains(name), "{error}");
     }
 }

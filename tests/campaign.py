@@ -128,22 +128,37 @@ def run_cells(faults: list[Planned], seed: int, until_s: float = float("inf")) -
         # Those of the next one's cell first, among the next ones.
         layout = left[0].layout
         left[:ROUND] = sorted(left[:ROUND], key=lambda planned: planned.layout is not layout)
-        with working_cell(layout, seed=left[0].number) as bench:
-            went_on = begin(bench)
-            for _ in range(FAULTS_OF_A_CELL):
-                goes_on = went_on.startswith(("moves", "resumed")) and time.monotonic() < until_s
-                if not left or left[0].layout is not layout or not goes_on:
-                    break
-                planned = left.pop(0)
-                line = Injected(seed, planned.number, planned.fault.__name__, round(planned.moment_s, 3), "")
-                known = len(bench.monitor.violations)
-                try:
-                    line.went_on = went_on = inject(bench, planned.fault, planned.moment_s)
-                except (TimeoutError, AssertionError) as error:
-                    line.hung = went_on = str(error) or type(error).__name__
-                line.violations = [(found.kind.value, found.text) for found in bench.monitor.violations[known:]][:5]
-                print(f"{json.dumps(dataclasses.asdict(line))}", file=sys.stderr, flush=True)
-                yield line
+        waiting, went_on = len(left), ""
+        try:
+            with working_cell(layout, seed=left[0].number) as bench:
+                went_on = begin(bench)
+                for _ in range(FAULTS_OF_A_CELL):
+                    goes_on = went_on.startswith(("moves", "resumed")) and time.monotonic() < until_s
+                    if not left or left[0].layout is not layout or not goes_on:
+                        break
+                    planned = left.pop(0)
+                    line = injected(planned, seed)
+                    known = len(bench.monitor.violations)
+                    try:
+                        line.went_on = went_on = inject(bench, planned.fault, planned.moment_s)
+                    except (TimeoutError, AssertionError) as error:
+                        line.hung = went_on = str(error) or type(error).__name__
+                    line.violations = [(found.kind.value, found.text) for found in bench.monitor.violations[known:]][:5]
+                    print(f"{json.dumps(dataclasses.asdict(line))}", file=sys.stderr, flush=True)
+                    yield line
+        except TimeoutError as error:
+            went_on = str(error)
+        if len(left) == waiting and time.monotonic() < until_s:
+            # The cell did not get ready, or its first motion did not begin.
+            line = injected(left.pop(0), seed)
+            line.hung = f"no cell that works: {went_on}"
+            print(f"{json.dumps(dataclasses.asdict(line))}", file=sys.stderr, flush=True)
+            yield line
+
+
+def injected(planned: Planned, seed: int) -> Injected:
+    """A fault of which nothing is known yet."""
+    return Injected(seed, planned.number, planned.fault.__name__, round(planned.moment_s, 3), "")
 
 
 def summed(lines: list[Injected], faults: int, seed: int) -> dict[str, object]:

@@ -1,6 +1,6 @@
 //! What the check finds, and what it lets pass.
 
-use collision::{Carried, Clearance, CollisionChecker, Contact, Margins, Scene, Terrain};
+use collision::{Carried, Clearance, CollisionChecker, Contact, Margins, Scene, Terrain, lift_out};
 use heightmap::{Heightmap, Workspace};
 use nalgebra::{Isometry2, Isometry3, Point2, Point3, Vector2, Vector3};
 use pick_place::{PickPlace, PrimitiveSettings, Robot};
@@ -435,4 +435,42 @@ fn the_ways_home_of_every_shipped_arm_are_free() {
             "{file}: {free} free, {blocked:#?}"
         );
     }
+}
+
+#[test]
+fn only_something_long_and_thin_yields() {
+    let strip = |rows: std::ops::Range<usize>, cols: std::ops::Range<usize>| {
+        let rows_of_sides = if cols.start == 78 { rows.clone() } else { 0..0 };
+        let mut heightmap = empty_table();
+        for row in rows {
+            heightmap.height_m[row * 160 + cols.start..row * 160 + cols.end].fill(0.012);
+        }
+        // Sides that seem to slope, and gaps.
+        for row in rows_of_sides {
+            heightmap.height_m[row * 160 + 77] = 0.005;
+            if row % 5 == 2 {
+                heightmap.height_m[row * 160 + 77..row * 160 + 82].fill(0.0055);
+            }
+        }
+        let at = heightmap.workspace.point_m(&Point2::new(80.0, 160.0));
+        lift_out(
+            &heightmap,
+            &Arm::tip_down(&Isometry2::translation(at.x, at.y), 0.012),
+        )
+        .unwrap()
+    };
+    // A cable of 12 mm, 0.5 m long.
+    let (cable, rest) = strip(80..240, 78..82);
+    assert!(cable.yields && cable.radius_m() < 0.04, "{cable:?}");
+    // Most of it still lies there.
+    assert_eq!(rest.height_m[160 * 160 + 80], 0.0);
+    assert_eq!(rest.height_m[180 * 160 + 80], 0.012);
+    // A stick of 0.1 m, and a sheet.
+    let (stick, _) = strip(144..176, 78..82);
+    assert!(!stick.yields && stick.radius_m() > 0.04, "{stick:?}");
+    let (sheet, _) = strip(80..240, 60..100);
+    assert!(!sheet.yields, "{sheet:?}");
+    // The bare table.
+    let (nothing, _) = strip(0..0, 0..0);
+    assert!(!nothing.yields, "{nothing:?}");
 }

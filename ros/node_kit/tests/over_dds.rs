@@ -92,6 +92,61 @@ async fn what_arrived_before_its_sender_ended_can_be_read_after_that() {
     assert_eq!(received.expect("last words").data, 7.0);
 }
 
+/// Names the domain of [`subscriber_until_it_is_killed`].
+const DOMAIN: &str = "NODE_KIT_TEST_DOMAIN";
+
+/// Run by the test below, as a process that can be killed.
+#[tokio::test(flavor = "multi_thread")]
+#[ignore = "a part of the test below"]
+async fn subscriber_until_it_is_killed() {
+    let domain_id = std::env::var(DOMAIN).unwrap().parse().unwrap();
+    let context = Context::new(Network {
+        domain_id,
+        localhost_only: true,
+    });
+    let node = node(&context, "killed", "");
+    let mut subscription = node.subscription::<Float64>("state", Qos::Latched).unwrap();
+    loop {
+        subscription.recv().await;
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_subscriber_that_was_killed_holds_back_no_latched_message() {
+    let network = Network::unused().unwrap();
+    let context = Context::new(network);
+    let sender = node(&context, "sender", "");
+    let receiver = node(&context, "receiver", "");
+    let mut subscription = receiver
+        .subscription::<Float64>("state", Qos::Latched)
+        .unwrap();
+    let publisher = sender.publisher::<Float64>("state", Qos::Latched).unwrap();
+    let mut killed = std::process::Command::new(std::env::current_exe().unwrap())
+        .args(["--ignored", "--exact", "subscriber_until_it_is_killed"])
+        .env(DOMAIN, network.domain_id.to_string())
+        .stdout(std::process::Stdio::null())
+        .spawn()
+        .unwrap();
+    let heard = async {
+        while sender.graph().subscriptions("/state") < 2 {
+            tokio::time::sleep(Duration::from_millis(20)).await;
+        }
+    };
+    let heard = timeout(LIMIT, heard).await;
+    killed.kill().unwrap();
+    killed.wait().unwrap();
+    heard.expect("both subscribe");
+    // Far fewer than come in the 50 s in which the killed one still counts as alive.
+    for number in 0..40 {
+        publisher.publish(Float64 {
+            data: f64::from(number),
+        });
+        tokio::time::sleep(Duration::from_millis(20)).await;
+    }
+    let last = async { while subscription.recv().await.data < 39.0 {} };
+    timeout(LIMIT, last).await.expect("the newest message");
+}
+
 #[tokio::test(flavor = "multi_thread")]
 async fn images_arrive() {
     let context = Context::new(Network::unused().unwrap());

@@ -89,6 +89,8 @@ struct Shared {
   // (TRANSIENT_LOCAL / TRANSIENT / PERSISTENT) the writer must retain samples for
   // late-joining readers, so pre-match trimming is disabled.
   volatile: bool,
+  // True for a KeepLast writer that serves late joiners: see `give_way`.
+  newest_wins: bool,
   topic_name: String,
 }
 
@@ -117,6 +119,7 @@ impl WriterSendBuffer {
     window_limit: usize,
     backlog_limit: usize,
     max_retain: usize,
+    keep_last: bool,
   ) -> Self {
     Self {
       shared: Arc::new(Shared {
@@ -137,6 +140,7 @@ impl WriterSendBuffer {
         reliable_writer,
         is_builtin,
         volatile,
+        newest_wins: keep_last && !volatile && reliable_writer && !is_builtin,
         topic_name,
       }),
     }
@@ -176,9 +180,30 @@ impl WriterSendBuffer {
       // window to wait on; the backlog limit above is their only throttle.
       return true;
     }
-    // Number of unacknowledged samples in [acked_before, last_seq].
-    let unacked = i64::from(inner.last_seq) - i64::from(inner.acked_before) + 1;
-    unacked < inner.window_limit as i64
+    Self::unacked(inner) < inner.window_limit as i64
+  }
+
+  // Number of unacknowledged samples in [acked_before, last_seq] that are still
+  // retained.
+  fn unacked(inner: &Inner) -> i64 {
+    let first = max(inner.acked_before, inner.first_seq);
+    i64::from(inner.last_seq) - i64::from(first) + 1
+  }
+
+  // A KeepLast writer that serves late joiners has something newest to say. A
+  // reader that acknowledges nothing, as its process was killed and its lease has
+  // not ended yet, must not hold that back from the others: the oldest sample
+  // gives way. HEARTBEATs tell the readers that it is not available any more.
+  fn give_way(shared: &Shared, inner: &mut Inner) {
+    if !shared.newest_wins || !inner.reliable_readers_present {
+      return;
+    }
+    while Self::unacked(inner) >= inner.window_limit as i64 {
+      let Some((oldest, _)) = inner.changes.pop_first() else {
+        return;
+      };
+      inner.first_seq = max(inner.first_seq, oldest.plus_1());
+    }
   }
 
   // Wake every parked producer / ack-waiter. Called after any state change that
@@ -211,6 +236,7 @@ impl WriterSendBuffer {
 
     let deadline = timeout.map(|t| Instant::now() + t);
     loop {
+      Self::give_way(shared, &mut inner);
       if Self::has_room(shared, &inner, may_block) {
         let seq = Self::insert_locked(shared, &mut inner, write_options, data, may_block);
         return Admission::Admitted(seq);
@@ -246,6 +272,7 @@ impl WriterSendBuffer {
     let shared = &*self.shared;
     let mut inner = shared.inner.lock().unwrap();
     let may_block = shared.reliable_writer || write_options.best_effort_may_block();
+    Self::give_way(shared, &mut inner);
     if Self::has_room(shared, &inner, may_block) {
       Ok(Self::insert_locked(
         shared,
@@ -485,6 +512,7 @@ mod tests {
       /* window_limit */ 1,
       /* backlog_limit */ 1000,
       /* max_retain */ 1,
+      false,
     );
     buf.set_acked_frontier(Some(SequenceNumber::zero()));
 
@@ -494,6 +522,30 @@ mod tests {
     // The reader's first ACKNACK acknowledges seq 1.
     buf.set_acked_frontier(Some(SequenceNumber::new(2)));
     assert!(admit_now(&buf, WriteOptions::default())); // seq 2
+  }
+
+  // A reader that was killed acknowledges nothing: a KeepLast writer that serves
+  // late joiners goes on all the same, with the newest samples.
+  #[test]
+  fn a_silent_reader_does_not_hold_back_the_newest_sample() {
+    let buf = WriterSendBuffer::new(
+      GUID::GUID_UNKNOWN,
+      "t".to_string(),
+      /* reliable_writer */ true,
+      /* is_builtin */ false,
+      /* volatile */ false,
+      /* window_limit */ 4,
+      /* backlog_limit */ 1000,
+      /* max_retain */ 1,
+      /* keep_last */ true,
+    );
+    buf.set_acked_frontier(Some(SequenceNumber::zero()));
+    for _ in 0..100 {
+      assert!(admit_now(&buf, WriteOptions::default()));
+    }
+    assert_eq!(buf.last_change_sequence_number(), SequenceNumber::new(100));
+    assert_eq!(buf.retained_len(), 4);
+    assert_eq!(buf.first_change_sequence_number(), SequenceNumber::new(97));
   }
 
   // nonblocking-transmit: a best-effort writer that opted in via
@@ -511,6 +563,7 @@ mod tests {
       /* window_limit */ 1000,
       /* backlog_limit */ 2,
       /* max_retain */ 1000,
+      false,
     );
 
     // Nothing sent yet: backlog fills after two admissions.
@@ -539,6 +592,7 @@ mod tests {
       /* window_limit */ 1000,
       /* backlog_limit */ 1,
       /* max_retain */ 1000,
+      false,
     );
     // Default WriteOptions => best_effort_may_block == false => never blocks.
     assert!(admit_now(&buf, WriteOptions::default()));
@@ -559,6 +613,7 @@ mod tests {
       1000,
       /* backlog_limit */ 1,
       /* max_retain */ 1000,
+      false,
     );
     assert!(admit_now(&buf, may_block_opts()));
     assert!(admit_now(&buf, may_block_opts()));
@@ -583,6 +638,7 @@ mod tests {
       /* window_limit */ 1000,
       /* backlog_limit */ 1000,
       max_retain,
+      false,
     );
 
     for _ in 0..100 {
@@ -618,6 +674,7 @@ mod tests {
       /* window_limit */ 1000,
       /* backlog_limit */ 1000,
       max_retain,
+      false,
     );
     // No reliable readers matched yet => admission not window-throttled.
     for _ in 0..10 {
@@ -646,6 +703,7 @@ mod tests {
       /* window_limit */ 1000,
       /* backlog_limit */ 1000,
       max_retain,
+      false,
     );
     // No reliable reader yet: admitted freely (backlog has room) but trimmed to
     // KeepLast so the buffer cannot balloon before discovery completes.

@@ -1,7 +1,7 @@
 use std::{
   cell::RefCell,
   collections::{BTreeMap, BTreeSet, HashMap, VecDeque},
-  net::{IpAddr, Ipv4Addr},
+  net::IpAddr,
   rc::Rc,
   sync::{Arc, RwLock},
   time::{Duration, Instant},
@@ -221,11 +221,7 @@ impl DPEventLoop {
 
     // We are on our own host: what is sent to our own readers goes over loopback.
     let mut observations = InterfaceObservations::new();
-    observations.record(
-      participant_guid_prefix,
-      None,
-      (Ipv4Addr::LOCALHOST, 0).into(),
-    );
+    observations.record_own(participant_guid_prefix);
     let interface_observations = Rc::new(RefCell::new(observations));
     let local_interfaces: Rc<[IfAddr]> = Rc::from(local_interface_table());
 

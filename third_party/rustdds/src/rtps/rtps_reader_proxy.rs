@@ -342,7 +342,14 @@ impl RtpsReaderProxy {
     local_multicast_ifaces: &[InterfaceSelector],
     selector: &dyn RouteSelector,
   ) {
-    let observed = observations.get(self.remote_reader_guid.prefix);
+    let GUID { prefix, entity_id } = self.remote_reader_guid;
+    // In what this participant says of itself, its own reader stands for all participants that it does not know
+    // yet, also those on other hosts.
+    if entity_id == EntityId::SPDP_BUILTIN_PARTICIPANT_READER && observations.is_own(prefix) {
+      self.send_route = SendRoute::fallback();
+      return;
+    }
+    let observed = observations.get(prefix);
     self.send_route = selector.select(
       &self.unicast_locator_list,
       &self.multicast_locator_list,
@@ -837,6 +844,30 @@ mod route_tests {
       route.multicast,
       Some((udp([239, 255, 0, 1], 7401), iface([10, 0, 0, 1])))
     );
+  }
+
+  #[test]
+  fn announcements_go_to_all_hosts_and_what_is_for_ourselves_over_loopback() {
+    let own = GuidPrefix::new(&[8; 12]);
+    let mut observations = InterfaceObservations::new();
+    observations.record_own(own);
+    let mut resolved = |prefix, entity_id| {
+      let mut rp = proxy_with_prefix(prefix);
+      rp.remote_reader_guid.entity_id = entity_id;
+      rp.unicast_locator_list = vec![udp([10, 0, 0, 5], 7410)];
+      rp.loopback_unicast_locators = vec![udp([127, 0, 0, 1], 7410)];
+      rp.multicast_locator_list = vec![udp([239, 255, 0, 1], 7400)];
+      rp.resolve_send_route(
+        &observations,
+        &[iface([10, 0, 0, 1])],
+        &DefaultRouteSelector::default(),
+      );
+      rp.send_route()
+    };
+    assert!(resolved(own, EntityId::SPDP_BUILTIN_PARTICIPANT_READER).fallback);
+    let ours = resolved(own, EntityId::SEDP_BUILTIN_SUBSCRIPTIONS_READER);
+    assert_eq!(ours.unicast, Some(udp([127, 0, 0, 1], 7410)));
+    assert!(!ours.fallback);
   }
 
   #[test]

@@ -23,7 +23,7 @@
 
 use std::{
   collections::BTreeMap,
-  net::{IpAddr, SocketAddr},
+  net::{IpAddr, Ipv4Addr, SocketAddr},
   time::{Duration, Instant},
 };
 
@@ -204,6 +204,8 @@ impl ObservedRoutes {
 #[derive(Debug, Default)]
 pub struct InterfaceObservations {
   by_participant: BTreeMap<GuidPrefix, ObservedRoutes>,
+  /// The participant that observes.
+  own: Option<GuidPrefix>,
 }
 
 impl InterfaceObservations {
@@ -224,6 +226,17 @@ impl InterfaceObservations {
       .entry(prefix)
       .or_default()
       .record(iface, source);
+  }
+
+  /// Record which participant is the own one: it is on its own host.
+  pub fn record_own(&mut self, prefix: GuidPrefix) {
+    self.own = Some(prefix);
+    self.record(prefix, None, (Ipv4Addr::LOCALHOST, 0).into());
+  }
+
+  /// Whether this is the participant that observes.
+  pub fn is_own(&self, prefix: GuidPrefix) -> bool {
+    self.own == Some(prefix)
   }
 
   pub fn get(&self, prefix: GuidPrefix) -> Option<&ObservedRoutes> {

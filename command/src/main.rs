@@ -19,6 +19,7 @@ mod idle;
 mod interfaces;
 mod latency;
 mod launch;
+mod operate;
 mod picture;
 mod problems;
 mod progress;
@@ -81,6 +82,8 @@ enum Command {
     Reliability(reliability::ReliabilityCommand),
     /// Launch the graph on a simulated cell, under an operator
     Launch(launch::Launch),
+    /// Decide at the terminal for a graph that runs, simulated or real
+    Operate(operate::Operate),
     /// Serve the operator's page for a graph that runs, simulated or real
     Console(console::ConsoleCommand),
     /// Write a checkpoint and its results as a folder in the layout of the Hugging Face hub; nothing is uploaded
@@ -116,6 +119,7 @@ fn main() -> Result<ExitCode> {
         Command::Table(table) => table.run(&root()?),
         Command::Evaluate(evaluate) => evaluate.run(&root()?),
         Command::Launch(launch) => launch.run(&root()?),
+        Command::Operate(operate) => operate.run(),
         Command::Calibrate(calibrate) => calibrate.run(&root()?),
         Command::Check(check) => return check.run(&root()?),
         Command::Console(console) => console.run(&root()?),

@@ -1,7 +1,7 @@
 //! `sctn launch`: the whole graph on a problem's seed, under an operator, recorded.
 
 pub mod graph;
-mod operator;
+pub mod operator;
 mod recording;
 
 use crate::demos::demonstration;
@@ -15,14 +15,12 @@ use msgs::convert::{self, heightmap_from_msg};
 use msgs::sctn_msgs::{ConfirmationRefused, Goal, PickPlace, Reward, StepConfirmation, StepResult};
 use multiravens::{Environment, EpisodeSeed, Problem};
 use node_kit::{Node, Qos, ns_from_stamp, plain_node, wait_for_end};
-use operator::{OperatorKind, RequireApproval};
+use operator::{OperatorKind, Prompt, RequireApproval, confirmation, described};
 use recording::{LAST_HEIGHTMAP, LAST_WORDS, RunRecorder};
 use serde::Serialize;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
-use step_protocol::{
-    Confirmation, Operator, OperatorDecision, Proposal, ProposalId, Question, StepOutcome,
-};
+use step_protocol::{Operator, OperatorDecision, ProposalId, Question, StepOutcome};
 
 /// With nothing heard for so long, something is broken. Wall time: it decides no outcome, only when to give up.
 const PATIENCE: Duration = Duration::from_secs(60);
@@ -510,7 +508,7 @@ impl Desk {
         match &question {
             Question::Approve(proposal) => {
                 self.step_started = Instant::now();
-                self.describe(proposal);
+                println!("{}", described(proposal, self.step_count));
             }
             Question::Confirm { result, reward, .. } => {
                 // The same motion may be asked about again: see `Operator::on_silence`.
@@ -538,15 +536,8 @@ impl Desk {
                 self.node.spawn_blocking(move || terminal(&ask)).await??
             }
         };
-        let confirmation = Confirmation {
-            stamp: Duration::from_nanos(self.node.clock().now_ns().max(0) as u64),
-            proposal_id: question.proposal_id(),
-            decision,
-            operator_name: "sctn launch".into(),
-        };
-        let message = convert::confirmation_to_msg(&confirmation);
-        self.confirmations
-            .publish(message.context("step_confirmation")?);
+        let message = confirmation(&self.node, question.proposal_id(), decision, "sctn launch")?;
+        self.confirmations.publish(message);
         Ok(())
     }
 
@@ -559,27 +550,6 @@ impl Desk {
             Some(probability) => probability >= self.asks_below,
             None => self.asks_below == f32::NEG_INFINITY,
         }
-    }
-
-    fn describe(&self, proposal: &Proposal) {
-        let (pick, place) = (&proposal.action.pick, &proposal.action.place);
-        let probability = proposal.success_probability;
-        let probability = probability.map(|probability| format!(", success {probability:.2}"));
-        let probability = probability.unwrap_or_default();
-        println!(
-            "step {}/{} attempt {}: {} pick ({:.3}, {:.3}) place ({:.3}, {:.3}, {:.0} deg), scores {:.2} {:.2}{probability}",
-            proposal.step,
-            self.step_count,
-            proposal.attempt,
-            proposal.module,
-            pick.translation.x,
-            pick.translation.y,
-            place.translation.x,
-            place.translation.y,
-            place.rotation.angle().to_degrees(),
-            proposal.pick_score,
-            proposal.place_score
-        );
     }
 
     /// Reward and heightmap of the last step come in any order.
@@ -602,37 +572,16 @@ impl Desk {
 /// Asks the person at the terminal.
 fn terminal(question: &Question) -> Result<OperatorDecision> {
     use std::io::Write;
-    let (text, answers): (&str, &[(&str, OperatorDecision)]) = match question {
-        Question::Approve(_) => (
-            "carry it out? [y]es, [n]o, [s]top",
-            &[
-                ("y", OperatorDecision::Approve),
-                ("n", OperatorDecision::Reject),
-                ("s", OperatorDecision::Stop),
-            ],
-        ),
-        Question::Confirm { .. } => (
-            "did the step succeed? [y]es, [n]o: try again, it undid an earlier step: go [b]ack, [s]top",
-            &[
-                ("y", OperatorDecision::Advance),
-                ("n", OperatorDecision::Retry),
-                ("b", OperatorDecision::StepBack),
-                ("s", OperatorDecision::Stop),
-            ],
-        ),
-    };
+    let prompt = Prompt::of(question);
     loop {
-        print!("    {text}: ");
+        print!("    {}: ", prompt.text);
         std::io::stdout().flush()?;
         let mut line = String::new();
         if std::io::stdin().read_line(&mut line)? == 0 {
             bail!("the terminal was closed: nobody is left to decide");
         }
-        if let Some((_, decision)) = answers
-            .iter()
-            .find(|(key, _)| *key == line.trim().to_lowercase())
-        {
-            return Ok(*decision);
+        if let Some(decision) = prompt.decision(&line) {
+            return Ok(decision);
         }
     }
 }

@@ -1,6 +1,11 @@
-//! Operators: who approves proposals and confirms steps.
+//! Operators: who approves proposals and confirms steps, and what a terminal asks them.
 
+use anyhow::{Context as _, Result};
 use clap::ValueEnum;
+use msgs::{convert, sctn_msgs};
+use node_kit::Node;
+use std::time::Duration;
+use step_protocol::{Confirmation, OperatorDecision, Proposal, ProposalId, Question};
 
 /// Which proposals an operator approves before they are carried out.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
@@ -38,4 +43,111 @@ pub enum OperatorKind {
     Watch,
     /// Nobody here: another program on the topics decides
     None,
+}
+
+/// A question at a terminal, and the keys that answer it.
+#[derive(Clone, Copy, Debug)]
+pub struct Prompt {
+    /// What is asked.
+    pub text: &'static str,
+    answers: &'static [(&'static str, OperatorDecision)],
+}
+
+impl Prompt {
+    /// May this proposal be carried out?
+    pub const APPROVE: Self = Self {
+        text: "carry it out? [y]es, [n]o, [s]top",
+        answers: &[
+            ("y", OperatorDecision::Approve),
+            ("n", OperatorDecision::Reject),
+            ("s", OperatorDecision::Stop),
+        ],
+    };
+    /// Has this step succeeded?
+    pub const CONFIRM: Self = Self {
+        text: "did the step succeed? [y]es, [n]o: try again, it undid an earlier step: go [b]ack, [s]top",
+        answers: &[
+            ("y", OperatorDecision::Advance),
+            ("n", OperatorDecision::Retry),
+            ("b", OperatorDecision::StepBack),
+            ("s", OperatorDecision::Stop),
+        ],
+    };
+
+    pub fn of(question: &Question) -> Self {
+        match question {
+            Question::Approve(_) => Self::APPROVE,
+            Question::Confirm { .. } => Self::CONFIRM,
+        }
+    }
+
+    /// What a typed line decides; nothing where it is none of the keys.
+    pub fn decision(&self, line: &str) -> Option<OperatorDecision> {
+        let key = line.trim().to_lowercase();
+        let mut answers = self.answers.iter();
+        answers
+            .find(|answer| answer.0 == key)
+            .map(|answer| answer.1)
+    }
+}
+
+/// A proposal in one line.
+pub fn described(proposal: &Proposal, step_count: u32) -> String {
+    let (pick, place) = (&proposal.action.pick, &proposal.action.place);
+    let probability = proposal.success_probability;
+    let probability = probability.map(|probability| format!(", success {probability:.2}"));
+    let probability = probability.unwrap_or_default();
+    format!(
+        "step {}/{step_count} attempt {}: {} pick ({:.3}, {:.3}) place ({:.3}, {:.3}, {:.0} deg), scores {:.2} {:.2}{probability}",
+        proposal.step,
+        proposal.attempt,
+        proposal.module,
+        pick.translation.x,
+        pick.translation.y,
+        place.translation.x,
+        place.translation.y,
+        place.rotation.angle().to_degrees(),
+        proposal.pick_score,
+        proposal.place_score
+    )
+}
+
+/// A decision of now, as a message.
+pub fn confirmation(
+    node: &Node,
+    proposal_id: ProposalId,
+    decision: OperatorDecision,
+    operator_name: &str,
+) -> Result<sctn_msgs::StepConfirmation> {
+    let confirmation = Confirmation {
+        stamp: Duration::from_nanos(node.clock().now_ns().max(0) as u64),
+        proposal_id,
+        decision,
+        operator_name: operator_name.into(),
+    };
+    convert::confirmation_to_msg(&confirmation).context("step_confirmation")
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_line_decides_by_its_key_and_anything_else_decides_nothing() {
+        assert_eq!(
+            Prompt::APPROVE.decision(" Y\n"),
+            Some(OperatorDecision::Approve)
+        );
+        assert_eq!(
+            Prompt::CONFIRM.decision("y"),
+            Some(OperatorDecision::Advance)
+        );
+        assert_eq!(
+            Prompt::CONFIRM.decision("b"),
+            Some(OperatorDecision::StepBack)
+        );
+        for line in ["", "yes", "b", "ys"] {
+            assert_eq!(Prompt::APPROVE.decision(line), None, "{line}");
+        }
+    }
 }

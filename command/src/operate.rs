@@ -117,7 +117,7 @@ fn lines_of_terminal() -> mpsc::UnboundedReceiver<String> {
 /// What is to be decided.
 enum Due {
     /// About a proposal or a step.
-    Question(Question),
+    Question(Box<Question>),
     /// Whether the arm goes home.
     Home(ProposalId),
 }
@@ -139,7 +139,10 @@ impl Due {
 
     /// Whether an answer moves the arm.
     fn moves(&self) -> bool {
-        matches!(self, Self::Question(Question::Approve(_)) | Self::Home(_))
+        match self {
+            Self::Question(question) => matches!(**question, Question::Approve(_)),
+            Self::Home(_) => true,
+        }
     }
 }
 
@@ -237,7 +240,7 @@ impl Desk {
             Question::Confirm { .. } if self.approve_only => return,
             Question::Confirm { .. } => {}
         }
-        self.due = Some(Due::Question(question));
+        self.due = Some(Due::Question(Box::new(question)));
         self.prompt();
     }
 

@@ -35,7 +35,7 @@ use msgs::Action;
 use crate::{
     clock::Clock,
     graph::Graph,
-    service::{CLIENT_DISCOVERY_TIMEOUT, CallError, CallOptions, attempt},
+    service::{CLIENT_DISCOVERY_TIMEOUT, CallError, CallOptions, ask, attempt},
     statistics::Statistics,
 };
 
@@ -608,12 +608,9 @@ impl<A: Action + 'static> ActionClient<A> {
         let goal_id = GoalId::new_random();
         let _one_at_a_time = self.goal_call.lock().await;
         let reply = attempt(&self.name, options, || {
-            self.client
-                .goal_client()
-                .async_call_service(SendGoalRequest {
-                    goal_id,
-                    goal: goal.clone(),
-                })
+            let goal = goal.clone();
+            let request = SendGoalRequest { goal_id, goal };
+            ask(self.client.goal_client(), &self.name, request)
         })
         .await?;
         if !reply.accepted {
@@ -634,7 +631,7 @@ impl<A: Action + 'static> ActionClient<A> {
             goal_id,
             goal: goal.clone(),
         };
-        let answer = self.client.goal_client().async_call_service(request);
+        let answer = ask(self.client.goal_client(), &self.name, request);
         futures::pin_mut!(answer);
         let reply = loop {
             match tokio::time::timeout(SERVER_LOST, answer.as_mut()).await {

@@ -7,7 +7,7 @@ use std::{
     time::{Duration, Instant},
 };
 
-use ros2_client::{Gid, RmwRequestId, service::CallServiceError};
+use ros2_client::{Gid, Message, ReadError, RmwRequestId, service::CallServiceError};
 use tokio::{sync::Mutex, time::timeout};
 use tracing::debug;
 
@@ -84,8 +84,30 @@ impl CallError {
     }
 }
 
+/// Sends a request once and waits for its reply. What cannot be read is skipped: anybody may have sent it, also before the request.
+pub(crate) async fn ask<Q: Message + 'static, R: Message + 'static>(
+    client: &ros2_client::Client<Q, R>,
+    name: &str,
+    request: Q,
+) -> Result<R, CallServiceError<()>> {
+    let id = client.async_send_request(request).await?;
+    loop {
+        match client.async_receive_response(id).await {
+            Ok(reply) => return Ok(reply),
+            Err(error) => skipped(name, &error).await,
+        }
+    }
+}
+
+/// Says that something was no reply.
+async fn skipped(name: &str, error: &ReadError) {
+    debug!("{name}: not a reply: {error}");
+    // It must not keep the limit of the call from passing.
+    tokio::task::yield_now().await;
+}
+
 /// Tries a call several times; each attempt has its own request id, and an answer to any earlier
-/// one is ignored.
+/// one is ignored. One that meets something that cannot be read is made again within its time.
 pub(crate) async fn attempt<T, F>(
     name: &str,
     options: &CallOptions,
@@ -96,7 +118,15 @@ where
 {
     let mut last = None;
     for number in 1..=options.attempts {
-        match timeout(options.timeout, call()).await {
+        let attempt = async {
+            loop {
+                match call().await {
+                    Err(CallServiceError::ReadError(error)) => skipped(name, &error).await,
+                    answer => return answer,
+                }
+            }
+        };
+        match timeout(options.timeout, attempt).await {
             Ok(Ok(reply)) => return Ok(reply),
             Ok(Err(error)) => last = Some(error.to_string()),
             Err(_) => debug!("{name}: no reply to request {number}"),
@@ -149,7 +179,7 @@ impl<S: Service> ServiceClient<S> {
     ) -> Result<S::Response, CallError> {
         let client = self.client.lock().await;
         attempt(&self.name, options, || {
-            client.async_call_service(request.clone())
+            ask(&client, &self.name, request.clone())
         })
         .await
     }

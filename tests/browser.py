@@ -107,5 +107,5 @@ class Person:
 
     def close(self) -> None:
         """Leaves; nothing went wrong on the page."""
-        assert self.errors == []
+        assert self.errors == [], self.errors
         self.context.close()

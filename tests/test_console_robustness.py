@@ -25,8 +25,13 @@ from test_operator_console import CLIENT, as_arguments, slow_down, until
 MOMENTS = int(os.environ.get("MOMENTS", "3"))
 # How long input is fuzzed.
 SECONDS = float(os.environ.get("SECONDS", "4"))
-# How long the idle console is watched.
-IDLE_S = 5.0
+# What it takes while it is idle is its share of a core over so many windows in a row.
+IDLE_WINDOWS = 5
+WINDOW_S = 1.0
+# At most this share of a core.
+IDLE_SHARE = 0.02
+# By then it has encoded the pictures and discovered the graph, also on a busy machine.
+SETTLES_WITHIN_S = 30.0
 # How long ten viewers watch.
 VIEWING_S = float(os.environ.get("VIEWING_S", "4"))
 
@@ -189,9 +194,28 @@ def test_random_input_of_somebody_with_the_token_moves_nothing_and_the_page_work
 
 
 def processor_s(process: Process) -> float:
-    """Time on a processor, of all threads."""
-    fields = pathlib.Path(f"/proc/{process.pid}/stat").read_text().rsplit(")", 1)[1].split()
-    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+    """Time on a processor, of all threads: the process's clock, which counts nanoseconds (clock_getcpuclockid(3))."""
+    return time.clock_gettime(~process.pid << 3 | 2)
+
+
+def idle_share(process: Process, page: WebSocket) -> float:
+    """What the process takes of a core once it has settled, with a page open.
+
+    The share over the last windows in a row, as soon as it is small enough; else the smallest that there was in the time allowed.
+    """
+    shares: list[float] = []
+    smallest = float("inf")
+    end = time.monotonic() + SETTLES_WITHIN_S
+    while smallest > IDLE_SHARE and time.monotonic() < end:
+        begin_s, begun_s = processor_s(process), time.monotonic()
+        while (left_s := begun_s + WINDOW_S - time.monotonic()) > 0:
+            page.send(b'{"type": "present", "visible": true}')
+            page.receive_until(time.monotonic() + min(0.2, left_s))
+        shares.append((processor_s(process) - begin_s) / (time.monotonic() - begun_s))
+        if len(shares) >= IDLE_WINDOWS:
+            smallest = min(smallest, sum(shares[-IDLE_WINDOWS:]) / IDLE_WINDOWS)
+    print(f"share of a core in each window: {', '.join(f'{100 * share:.1f} %' for share in shares)}")
+    return smallest
 
 
 def test_an_idle_console_takes_little_and_ten_viewers_and_a_slow_one_cost_no_memory_and_slow_nobody(start, tmp_path: pathlib.Path) -> None:
@@ -202,14 +226,10 @@ def test_an_idle_console_takes_little_and_ten_viewers_and_a_slow_one_cost_no_mem
     proposal = approvable(ada)
     # A proposal waits, and one page is open.
     page = WebSocket(address, ada._headers["X-Session"])
-    begin_s, begun_s = processor_s(process), time.monotonic()
-    while time.monotonic() < begun_s + IDLE_S:
-        page.send(b'{"type": "present", "visible": true}')
-        page.receive_until(time.monotonic() + 0.2)
-    share = (processor_s(process) - begin_s) / (time.monotonic() - begun_s)
+    share = idle_share(process, page)
     page.close()
     print(f"idle: {100 * share:.1f} % of a core")
-    assert share <= 0.02
+    assert share <= IDLE_SHARE
 
     def presence_s() -> float:
         begin = time.monotonic()

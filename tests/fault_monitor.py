@@ -15,8 +15,12 @@ REST_TIME_S = 0.2
 # Status of a goal in action_msgs/GoalStatus: accepted, executing and cancelling ones move the arm.
 UNDER_WAY = (1, 2, 3)
 CANCELED, ABORTED = 5, 6
-# A goal that the driver accepts after the stop can be cancelled only then: the arm may move for so long.
+# A goal that the driver accepts after the stop can be cancelled only then: the arm may move for so long, ...
 LATE_GOAL_S = 0.3
+# ... and by so much: a descent to contact is slow, 0.05 m/s, some 0.1 rad/s.
+LATE_GOAL_RAD = 0.05
+# A driver has accepted by then whatever it was sent before a stop: until_answer_max_s of config/hardware/realistic.yaml, on a busy machine.
+ANSWER_S = 2.3
 
 
 class Kind(enum.Enum):
@@ -70,8 +74,11 @@ class Monitor:
     _voided: dict[int, str] = dataclasses.field(default_factory=dict)
     # Status of each goal of each action of the driver.
     _goals: dict[str, dict[bytes, int]] = dataclasses.field(default_factory=dict)
-    # When a goal was accepted after the stop.
+    # Whether nothing was under way when the stop came: only then can a goal be on its way to the driver.
+    _may_be_unanswered: bool = False
+    # When a goal that was on its way was accepted after the stop, and where the arm was.
     _late_goal_at: float | None = None
+    _late_from: list[float] | None = None
 
     def on_proposal(self, proposal_id: int) -> None:
         """The newest proposal replaces the one before, but not the one that is being carried out."""
@@ -110,6 +117,7 @@ class Monitor:
             self._stopped_at, self._limit_s, self.rest_after_s = now, limit_s, 0.0
             self._void = []
             self._late_goal_at = None
+            self._may_be_unanswered = not any(status in UNDER_WAY for goals in self._goals.values() for status in goals.values())
 
     def on_end(self, proposal_id: int, now: float) -> None:
         """The executor says that a motion has ended: nothing moves any more."""
@@ -126,7 +134,7 @@ class Monitor:
     def on_goals(self, action: str, statuses: Mapping[bytes, int], now: float, answers_late: bool = False) -> None:
         """The statuses of an action's goals: no goal comes while another is under way.
 
-        Where the driver takes its time to answer, a goal from before a stop may be accepted after it.
+        Where the driver takes its time to answer, one goal from before a stop may be accepted after it.
         """
         before = self._goals.get(action, {})
         self._goals[action] = dict(statuses)
@@ -135,8 +143,10 @@ class Monitor:
         under_way = [goal for goal, status in statuses.items() if status in UNDER_WAY]
         if new and (replaced or len(under_way) > 1):
             self._violate(Kind.TWO_GOALS, "a goal takes the place of one under way: two executors act on one approval", now)
-        if new and answers_late and self._stopped_at is not None and self._late_goal_at is None:
-            self._late_goal_at = now
+        if new and answers_late and self._may_be_unanswered and self._stopped_at is not None:
+            self._may_be_unanswered = False
+            if now - self._stopped_at <= ANSWER_S + OVERTAKING_S:
+                self._late_goal_at, self._late_from = now, self._positions
 
     def on_lost_sight(self) -> None:
         """The driver says nothing any more: where the arm has come to rest meanwhile is not known before the next reading."""
@@ -155,8 +165,7 @@ class Monitor:
             self._violate(Kind.UNAPPROVED, f"the arm moves without an approval: {'; '.join(self._void) or 'there is none'}", now)
         elif self._stopped_at is not None:
             after_s = now - self._stopped_at
-            accepted_late = self._late_goal_at is not None and now - self._late_goal_at <= LATE_GOAL_S + OVERTAKING_S
-            late = after_s > self._limit_s + OVERTAKING_S and not accepted_late
+            late = after_s > self._limit_s + OVERTAKING_S and not self._is_of_late_goal(positions, now)
             if late and self._void:
                 self._violate(Kind.UNAPPROVED, f"the arm moves {after_s:.2f} s after it had to stop: {'; '.join(self._void)}", now)
             elif late and rested:
@@ -166,6 +175,12 @@ class Monitor:
                 self._violate(Kind.AFTER_STOP, text, now)
             if not rested:
                 self.rest_after_s = after_s
+
+    def _is_of_late_goal(self, positions: list[float], now: float) -> bool:
+        """Whether the arm may move here because a goal was accepted after the stop and is being cancelled."""
+        if self._late_goal_at is None or now - self._late_goal_at > LATE_GOAL_S + OVERTAKING_S:
+            return False
+        return self._late_from is None or max(abs(a - b) for a, b in zip(positions, self._late_from, strict=True)) <= LATE_GOAL_RAD
 
     def _violate(self, kind: Kind, text: str, now: float) -> None:
         self.violations.append(Violation(kind, text, now))

@@ -145,16 +145,51 @@ def test_the_monitor_lets_an_approved_motion_and_the_noise_of_an_arm_at_rest_pas
     assert not monitor.violations
 
 
-def test_a_goal_that_is_accepted_after_a_stop_may_move_the_arm_until_it_is_cancelled(monitor: Monitor) -> None:
+def descend(monitor: Monitor, accepted_at: float, until: float, rate_rad_s: float = 0.1) -> None:
+    """Readings of an arm that comes down from the time at which the driver accepts the descent."""
+    for step in range(1, round(20 * (until - accepted_at)) + 1):
+        monitor.on_joints([1.0 + 0.05 * step * rate_rad_s, 0.0], accepted_at + 0.05 * step)
+
+
+def stopped_before_an_answer(monitor: Monitor) -> None:
+    """The approach has ended, the descent is asked for, and the stop comes at 1.1 s."""
     monitor.on_approval(2, "anna")
+    monitor.on_goals("follow", {b"a": 2}, 0.5)
     move(monitor, 1.0)
+    monitor.on_goals("follow", {b"a": 4}, 1.05)
     monitor.on_stop(1.1, 0.3)
-    monitor.on_goals("until", {b"a": 2}, 2.0, answers_late=True)
-    move(monitor, 2.1)
-    move(monitor, 2.3)
+
+
+def test_a_goal_that_is_accepted_after_a_stop_may_move_the_arm_slowly_until_it_is_cancelled(monitor: Monitor) -> None:
+    stopped_before_an_answer(monitor)
+    monitor.on_goals("until", {b"b": 2}, 2.0, answers_late=True)
+    descend(monitor, 2.0, 2.3)
     assert not monitor.violations
-    move(monitor, 2.4)
+    monitor.on_joints([1.04, 0.0], 2.4)
     assert [found.kind for found in monitor.violations] == [Kind.AFTER_STOP]
+
+
+@pytest.mark.parametrize("stop_is_while", ["it moves", "nothing is asked for any more", "the arm moves fast", "another was accepted late"])
+def test_nothing_else_hides_behind_a_goal_that_is_accepted_after_a_stop(monitor: Monitor, stop_is_while: str) -> None:
+    stopped_before_an_answer(monitor)
+    accepted_at, rate = 2.0, 0.1
+    match stop_is_while:
+        case "it moves":
+            # The goal under way was stopped: the next one was sent after that.
+            monitor.on_goals("follow", {b"c": 2}, 1.15)
+            monitor._stopped_at = None
+            monitor.on_stop(1.2, 0.3)
+            monitor.on_goals("follow", {b"c": 5}, 1.3)
+        case "nothing is asked for any more":
+            accepted_at = 3.6
+        case "the arm moves fast":
+            rate = 0.6
+        case "another was accepted late":
+            monitor.on_goals("until", {b"d": 2}, 1.3, answers_late=True)
+            monitor.on_goals("until", {b"d": 5}, 1.4, answers_late=True)
+    monitor.on_goals("until", {b"d": 5, b"b": 2}, accepted_at, answers_late=True)
+    descend(monitor, accepted_at, accepted_at + 0.25, rate)
+    assert Kind.AFTER_STOP in [found.kind for found in monitor.violations]
 
 
 def test_the_monitor_catches_a_motion_on_an_approval_that_must_not_count(monitor: Monitor) -> None:

@@ -78,8 +78,6 @@ pub struct Scene<'a> {
     pub terrain: Option<&'a Terrain>,
     /// What the gripper holds.
     pub carried: Option<Carried>,
-    /// What stands in the way of what is carried, where that is not the whole terrain.
-    pub carried_terrain: Option<&'a Terrain>,
     /// Where contact is wanted.
     pub contacts: Vec<Contact>,
 }
@@ -391,11 +389,7 @@ impl CollisionChecker {
                 }
             }
             let yields = touches && scene.carried.is_some_and(|carried| carried.yields);
-            let terrain = match touches {
-                true => scene.carried_terrain.or(scene.terrain),
-                false => scene.terrain,
-            };
-            if let Some(terrain) = terrain.filter(|_| !yields) {
+            if let Some(terrain) = scene.terrain.filter(|_| !yields) {
                 let most_m = self.margins.obstacle_m.max(self.margins.slow_m);
                 let is_tool = touches || part.carrier == Some(TOOL);
                 let found = terrain_clearance(part, &pose, terrain, most_m, |at, height_m| {

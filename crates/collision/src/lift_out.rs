@@ -9,6 +9,8 @@ use ur5::Shape;
 const STEP_M: f32 = 0.006;
 /// It also does where its height differs by less from that of the pick: beads of a cable have gaps.
 const LEVEL_M: f32 = 0.008;
+/// Parts of something thin that are so many cells away from each other are parts of the same: the shadow of what stands beside it lies between them.
+const BRIDGE: isize = 2;
 /// Cells further from the pick belong to something else, the table for instance.
 const REACH_M: f64 = 0.15;
 /// How far from its axis the cup holds a part of something larger.
@@ -40,50 +42,51 @@ pub fn lift_out(heightmap: &Heightmap, tip: &Isometry3<f64>) -> Option<(Carried,
     let stands_out = heightmap.height_m[start] > ground_m + STEP_M;
     let is_ground =
         |index: usize| stands_out && heightmap.height_m[index] < ground_m + 0.5 * STEP_M;
-    let mut member = vec![false; workspace.len()];
-    member[start] = true;
-    let (mut object, mut border, mut next) = (vec![start], Vec::new(), 0);
-    while next < object.len() {
-        let index = object[next];
-        next += 1;
-        let (row, col) = (index / cols, index % cols);
-        let sides = [
-            (row > 0).then(|| index - cols),
-            (row + 1 < rows).then(|| index + cols),
-            (col > 0).then(|| index - 1),
-            (col + 1 < cols).then(|| index + 1),
-        ];
-        for side in sides
-            .into_iter()
-            .flatten()
-            .filter(|side| heightmap.is_seen(*side))
-        {
-            if member[side] {
-                continue;
-            }
-            let step_m = (heightmap.height_m[side] - heightmap.height_m[index]).abs();
-            let level_m = (heightmap.height_m[side] - heightmap.height_m[start]).abs();
-            let belongs = step_m < STEP_M || stands_out && level_m < LEVEL_M;
-            if belongs && !is_ground(side) && (center(side) - pick).norm() < REACH_M {
-                member[side] = true;
-                object.push(side);
-            } else {
-                border.push(side);
+    // Cells without a step between them, and those around them, which are something else. With a bridge, parts so many cells away that are as high as the pick belong to it.
+    let grown = |bridge: isize| {
+        let mut member = vec![false; workspace.len()];
+        member[start] = true;
+        let (mut object, mut border, mut next) = (vec![start], Vec::new(), 0);
+        while next < object.len() {
+            let index = object[next];
+            next += 1;
+            for side in within((index / cols, index % cols), (rows, cols), bridge) {
+                if member[side] || !heightmap.is_seen(side) {
+                    continue;
+                }
+                let step_m = (heightmap.height_m[side] - heightmap.height_m[index]).abs();
+                let level_m = (heightmap.height_m[side] - heightmap.height_m[start]).abs();
+                let belongs = bridge == 1 && step_m < STEP_M || stands_out && level_m < LEVEL_M;
+                if belongs && !is_ground(side) && (center(side) - pick).norm() < REACH_M {
+                    member[side] = true;
+                    object.push(side);
+                } else {
+                    border.push(side);
+                }
             }
         }
-    }
+        (object, member, border)
+    };
     // No step sets it apart from what is around it: a cable, or something as flat as the table's noise. What hangs at the cup counts.
-    let goes_on = object
-        .iter()
-        .any(|index| (center(*index) - pick).norm() > REACH_M - 2.0 * workspace.pixel_size_m);
-    let yields = goes_on
-        && is_thin(
-            &object,
-            &member,
-            (rows, cols),
-            THIN_M / workspace.pixel_size_m,
-        );
-    if goes_on {
+    let goes_on = |object: &[usize]| {
+        let far_m = REACH_M - 2.0 * workspace.pixel_size_m;
+        object
+            .iter()
+            .any(|index| (center(*index) - pick).norm() > far_m)
+    };
+    let thin_px = THIN_M / workspace.pixel_size_m;
+    let is_thin =
+        |object: &[usize], member: &[bool]| is_thin(object, member, (rows, cols), thin_px);
+    let (mut object, member, mut border) = grown(1);
+    let thin = is_thin(&object, &member);
+    let mut is_part = goes_on(&object);
+    if thin && !is_part {
+        // What stands against a cable hides some of it from the cameras.
+        let (whole, member, _) = grown(BRIDGE);
+        is_part = goes_on(&whole) && is_thin(&whole, &member);
+    }
+    let yields = is_part && thin;
+    if is_part {
         object.retain(|index| (center(*index) - pick).norm() < AT_THE_CUP_M);
         border.clear();
     }
@@ -130,6 +133,25 @@ pub fn lift_out(heightmap: &Heightmap, tip: &Isometry3<f64>) -> Option<(Carried,
         yields,
     };
     Some((carried, rest))
+}
+
+/// The cells around a cell, up to so many away: its sides where that is one.
+fn within(
+    (row, col): (usize, usize),
+    (rows, cols): (usize, usize),
+    reach: isize,
+) -> impl Iterator<Item = usize> {
+    let offsets =
+        (-reach..=reach).flat_map(move |down| (-reach..=reach).map(move |right| (down, right)));
+    offsets
+        .filter(move |(down, right)| reach > 1 || down.abs() + right.abs() == 1)
+        .filter_map(move |(down, right)| {
+            let (row, col) = (
+                row.checked_add_signed(down)?,
+                col.checked_add_signed(right)?,
+            );
+            (row < rows && col < cols).then_some(row * cols + col)
+        })
 }
 
 /// Height of the ground: most of the seen cells among some are higher than the lowest tenth of them.

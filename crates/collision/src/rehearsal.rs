@@ -2,7 +2,7 @@
 
 use crate::{Carried, Clearance, Collision, CollisionChecker, Contact, Scene, Terrain, lift_out};
 use heightmap::Heightmap;
-use nalgebra::{Isometry3, Point2, Point3, Vector3};
+use nalgebra::{Point2, Vector3};
 use pick_place::{ExecuteError, Outcome, PickPlace, PrimitiveSettings, Robot, go_home};
 use ur5::{Arm, JointTrajectory, Joints};
 
@@ -21,8 +21,6 @@ struct Rehearsal<'a> {
     heightmap: Option<Heightmap>,
     terrain: Option<Terrain>,
     carried: Option<Carried>,
-    /// The same without what stands so close to where the carried object stood that its box, which is larger than it is, cannot tell them apart.
-    carried_terrain: Option<Terrain>,
     /// Where the tool is in contact.
     contact: Option<Contact>,
     clearance: Clearance,
@@ -50,7 +48,6 @@ pub fn rehearse(
         heightmap: heightmap.cloned(),
         terrain: heightmap.map(Terrain::new),
         carried: None,
-        carried_terrain: None,
         contact: None,
         clearance: Clearance {
             least_m: f64::INFINITY,
@@ -83,7 +80,6 @@ pub fn rehearse_home(
         heightmap: None,
         terrain: heightmap.map(Terrain::new),
         carried,
-        carried_terrain: None,
         contact: None,
         clearance: Clearance {
             least_m: f64::INFINITY,
@@ -118,7 +114,6 @@ impl Rehearsal<'_> {
         let scene = Scene {
             terrain: self.terrain.as_ref(),
             carried: self.carried,
-            carried_terrain: self.carried_terrain.as_ref(),
             contacts,
         };
         let found = self.checker.check(trajectory, &scene)?;
@@ -137,29 +132,6 @@ impl Rehearsal<'_> {
             .flat_map(|terrain| terrain.columns(at - around, at + around));
         columns.map(|column| column.height_m).fold(0.0, f64::max)
     }
-}
-
-/// A heightmap without what the box of an object overlaps where it was picked, or is nearer to than a margin.
-fn without_neighbours(
-    heightmap: &Heightmap,
-    carried: &Carried,
-    tip: &Isometry3<f64>,
-    margin_m: f64,
-) -> Terrain {
-    let workspace = &heightmap.workspace;
-    let shape = tip * carried.tip_from_shape;
-    let half_m = Vector3::from_fn(|axis, _| carried.shape.extent_m(&Vector3::ith(axis, 1.0)));
-    let reach_m = half_m.add_scalar(margin_m + workspace.pixel_size_m);
-    let mut rest = heightmap.clone();
-    for index in 0..workspace.len() {
-        let (row, col) = (index / workspace.cols, index % workspace.cols);
-        let at = workspace.center(heightmap::Pixel { row, col });
-        let in_shape = shape.inverse_transform_point(&Point3::new(at.x, at.y, shape.translation.z));
-        if in_shape.x.abs() <= reach_m.x && in_shape.y.abs() <= reach_m.y {
-            rest.height_m[index] = 0.0;
-        }
-    }
-    Terrain::new(&rest)
 }
 
 impl Robot for Rehearsal<'_> {
@@ -213,17 +185,14 @@ impl Robot for Rehearsal<'_> {
         self.holds = on;
         if !on {
             self.carried = None;
-            self.carried_terrain = None;
         } else if let Some(heightmap) = &self.heightmap
             && let tip = self.arm.tip(&self.joints)
             && let Some((carried, rest)) = lift_out(heightmap, &tip)
         {
-            let margin_m = self.checker.margins().obstacle_m;
-            self.carried_terrain = Some(without_neighbours(&rest, &carried, &tip, margin_m));
             self.terrain = Some(Terrain::new(&rest));
             self.heightmap = Some(rest);
             self.carried = Some(carried);
-            // As wide as what is held.
+            // As wide as what is held: what stands beside it is passed on the way straight up, and on that way only.
             self.contact = Some(self.contact_here());
         }
         Ok(())

@@ -1,6 +1,8 @@
 //! What the check finds, and what it lets pass.
 
-use collision::{Carried, Clearance, CollisionChecker, Contact, Margins, Scene, Terrain, lift_out};
+use collision::{
+    Carried, Clearance, CollisionChecker, Contact, Margins, Scene, Terrain, lift_out, rehearse,
+};
 use heightmap::{Heightmap, Workspace};
 use nalgebra::{Isometry2, Isometry3, Point2, Point3, Vector2, Vector3};
 use pick_place::{PickPlace, PrimitiveSettings, Robot};
@@ -104,7 +106,7 @@ proptest! {
                 yields: false,
             });
             let contacts = contacts(&cell.arm, motion, 0.06);
-            let scene = Scene { terrain: Some(&terrain), carried, contacts, ..Scene::default() };
+            let scene = Scene { terrain: Some(&terrain), carried, contacts };
             let passed = checker.check(motion, &scene);
             prop_assert!(passed.is_ok(), "{}", passed.unwrap_err());
         }
@@ -269,7 +271,6 @@ fn what_is_carried_counts_and_contact_is_allowed_only_where_it_is_wanted() {
         terrain: Some(&terrain),
         carried,
         contacts,
-        ..Scene::default()
     };
     checker.check(&line, &scene(None, vec![])).unwrap();
     let collision = checker
@@ -438,6 +439,45 @@ fn the_ways_home_of_every_shipped_arm_are_free() {
 }
 
 #[test]
+fn a_cable_of_which_a_peg_hides_a_part_is_a_cable_still() {
+    // 12 mm, 0.5 m long; a peg of 30 mm stands against it 30 mm from the pick, and hides it where it stands.
+    let mut heightmap = empty_table();
+    for row in 80..240 {
+        heightmap.height_m[row * 160 + 78..row * 160 + 82].fill(0.012);
+    }
+    for row in 170..178 {
+        heightmap.height_m[row * 160 + 80..row * 160 + 88].fill(0.03);
+        let hidden = row * 160 + 78;
+        heightmap.height_m[hidden..hidden + 2].fill(0.0);
+    }
+    let lift = |heightmap: &Heightmap, row: f64| {
+        let at = heightmap.workspace.point_m(&Point2::new(80.0, row));
+        let pick = Isometry2::translation(at.x, at.y);
+        lift_out(heightmap, &Arm::tip_down(&pick, 0.012)).unwrap().0
+    };
+    // The part on this side of the peg is short, its other end lies 25 cells away.
+    for row in 80..135 {
+        heightmap.height_m[row * 160 + 78..row * 160 + 82].fill(0.0);
+    }
+    let mut bead = heightmap.clone();
+    // Beside the peg one row of cells of the cable is seen now and then.
+    for row in (170..178).step_by(2) {
+        bead.height_m[row * 160 + 78..row * 160 + 80].fill(0.011);
+    }
+    let cable = lift(&bead, 150.0);
+    assert!(cable.yields && cable.radius_m() < 0.04, "{cable:?}");
+    // Where nothing leads past the peg, it is a stick.
+    let stick = lift(&heightmap, 150.0);
+    assert!(!stick.yields, "{stick:?}");
+    // So is one beside a block of its own height.
+    for row in 178..240 {
+        heightmap.height_m[row * 160 + 60..row * 160 + 100].fill(0.012);
+    }
+    let stick = lift(&heightmap, 150.0);
+    assert!(!stick.yields, "{stick:?}");
+}
+
+#[test]
 fn only_something_long_and_thin_yields() {
     let strip = |rows: std::ops::Range<usize>, cols: std::ops::Range<usize>| {
         let rows_of_sides = if cols.start == 78 { rows.clone() } else { 0..0 };
@@ -473,4 +513,58 @@ fn only_something_long_and_thin_yields() {
     // The bare table.
     let (nothing, _) = strip(0..0, 0..0);
     assert!(!nothing.yields, "{nothing:?}");
+}
+
+/// A block of 30 x 30 x 100 mm, and a wall of 6 mm beside it with a gap, across the way to the place.
+fn block_beside_a_wall(gap_m: f64, wall_m: f32) -> (Heightmap, PickPlace) {
+    let mut heightmap = empty_table();
+    let workspace = heightmap.workspace;
+    let pick = Vector2::new(0.5, -0.15);
+    for index in 0..workspace.len() {
+        let (row, col) = (index / workspace.cols, index % workspace.cols);
+        let at = workspace.center(heightmap::Pixel { row, col }).coords - pick;
+        let beyond_m = at.y - 0.015 - gap_m;
+        if at.amax() < 0.015 {
+            heightmap.height_m[index] = 0.1;
+        } else if (0.0..0.006).contains(&beyond_m) {
+            heightmap.height_m[index] = wall_m;
+        }
+    }
+    let pose = |at| Isometry2::new(at, 0.0);
+    let action = PickPlace {
+        pick: pose(pick),
+        place: pose(Vector2::new(0.5, 0.2)),
+    };
+    (heightmap, action)
+}
+
+#[test]
+fn what_stands_beside_an_object_is_passed_on_its_way_straight_up_and_not_after_it() {
+    let cell = cell();
+    let checker = checker(&cell);
+    // Lifted by 60 mm, at 0.15 m/s.
+    let settings = PrimitiveSettings::BEADS;
+    let rehearsed = |gap_m: f64, wall_m: f32| {
+        let (heightmap, action) = block_beside_a_wall(gap_m, wall_m);
+        let (arm, home) = (&cell.arm, &cell.arm.home);
+        rehearse(
+            &checker,
+            arm,
+            &action,
+            &settings,
+            home,
+            false,
+            Some(&heightmap),
+        )
+    };
+    for gap_m in [0.005, 0.02] {
+        // The block hangs over a wall that is as low as that.
+        rehearsed(gap_m, 0.05).unwrap();
+        // A wall of 90 mm is higher than the block was lifted, and lower than the cup.
+        let refused = rehearsed(gap_m, 0.09).unwrap_err().to_string();
+        assert!(
+            refused.contains("Transfer") && refused.contains("the carried object"),
+            "{gap_m}: {refused}"
+        );
+    }
 }

@@ -69,12 +69,10 @@ fn with_post(heightmap: &Heightmap, action: &PickPlace) -> Heightmap {
 
 #[test]
 fn what_demonstrators_do_is_free_and_a_post_in_their_way_is_found() {
-    // A cable of which a peg hides the rest counts as something short and stiff: one draw of it round a peg is refused.
-    for (problem, least, most_refused) in [("placing", 5, 0), ("stacking", 5, 0), ("routing", 5, 1)]
-    {
+    for problem in ["placing", "stacking", "routing"] {
         let (count, refused, through) = refusals(problem, &[10_000, 10_002]);
         assert!(
-            count >= least && refused.len() <= most_refused,
+            count >= 5 && refused.is_empty(),
             "{problem}: {count} actions, {refused:#?}"
         );
         assert_eq!(through, 0, "{problem}: {count} actions through a post");

@@ -148,6 +148,89 @@ async fn a_subscriber_that_was_killed_holds_back_no_latched_message() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
+async fn a_node_that_publishes_a_topic_keeps_no_more_of_what_it_receives_there() {
+    const SENT: u32 = 1000;
+    // A subscription's own limit, and what may arrive before the oldest are dropped.
+    const KEPT: usize = 256 + 64;
+    let network = Network::unused().unwrap();
+    let (sending, receiving) = (Context::new(network), Context::new(network));
+    let sender = node(&sending, "sender", "");
+    let receiver = node(&receiving, "receiver", "");
+    // A publisher may keep up to 4,096 messages of its own.
+    let _publisher = receiver
+        .publisher::<Float64>("readings", Qos::Event)
+        .unwrap();
+    let mut subscription = receiver
+        .subscription::<Float64>("readings", Qos::Event)
+        .unwrap();
+    let qos = RawQos {
+        reliable: true,
+        transient_local: false,
+        depth: SENT,
+    };
+    let publisher = sender
+        .raw_publisher("readings", "std_msgs/msg/Float64", qos)
+        .unwrap();
+    let known = async {
+        while receiver.graph().publishers("/readings") == 0
+            || sender.graph().subscriptions("/readings") == 0
+        {
+            tokio::time::sleep(Duration::from_millis(20)).await;
+        }
+    };
+    timeout(LIMIT, known).await.expect("both know each other");
+    for number in 0..SENT {
+        let reading = Float64 {
+            data: f64::from(number),
+        };
+        publisher.publish(msgs::to_cdr(&reading).unwrap());
+    }
+    let published = tokio::task::spawn_blocking(move || {
+        assert!(publisher.wait_until_heard(LIMIT));
+    });
+    published.await.unwrap();
+    let kept: Vec<f64> = std::iter::from_fn(|| subscription.try_recv())
+        .map(|reading| reading.data)
+        .collect();
+    assert_eq!(kept.last(), Some(&f64::from(SENT - 1)));
+    assert!(kept.len() <= KEPT, "{} are kept", kept.len());
+}
+
+/// On a network whose datagrams hold 1400 bytes, as many tunnels and containers have, a message just below the size of a fragment
+/// (1280 bytes) does not fit one with what goes before it.
+#[tokio::test(flavor = "multi_thread")]
+async fn a_message_of_every_size_around_that_of_a_fragment_arrives() {
+    let network = Network {
+        localhost_only: false,
+        ..Network::unused().unwrap()
+    };
+    let (sending, receiving) = (Context::new(network), Context::new(network));
+    let sender = node(&sending, "sender", "");
+    let receiver = node(&receiving, "receiver", "");
+    let publisher = sender.publisher::<Header>("names", Qos::Event).unwrap();
+    let mut subscription = receiver
+        .subscription::<Header>("names", Qos::Event)
+        .unwrap();
+    let known = async {
+        while receiver.graph().publishers("/names") == 0
+            || sender.graph().subscriptions("/names") == 0
+        {
+            tokio::time::sleep(Duration::from_millis(20)).await;
+        }
+    };
+    timeout(LIMIT, known).await.expect("both know each other");
+    for length in 1180..1300 {
+        publisher.publish(Header {
+            frame_id: "n".repeat(length),
+            ..Header::default()
+        });
+        let received = timeout(Duration::from_secs(10), subscription.recv()).await;
+        let received = received.unwrap_or_else(|_| panic!("a name of {length} bytes"));
+        assert_eq!(received.frame_id.len(), length);
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
 async fn images_arrive() {
     let context = Context::new(Network::unused().unwrap());
     let sender = node(&context, "sender", "");

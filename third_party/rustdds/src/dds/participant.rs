@@ -1575,9 +1575,19 @@ impl DomainParticipantInner {
       topic_kind,
     );
 
-    // Create the topic cache entry
+    // Create the topic cache entry. How much is kept is up to the QoS of the
+    // DataReaders alone (`update_keep_limits`): this topic may be meant for a
+    // DataWriter, which has a history of its own.
+    let no_reader_yet = QosPolicyBuilder::new()
+      .history(policy::History::KeepLast { depth: 1 })
+      .resource_limits(policy::ResourceLimits {
+        max_samples: 1,
+        max_instances: 1,
+        max_samples_per_instance: 1,
+      })
+      .build();
     let mut dds_cache_guard = self.dds_cache.write()?;
-    dds_cache_guard.add_new_topic(name, topic_type_desc, qos);
+    dds_cache_guard.add_new_topic(name, topic_type_desc, &no_reader_yet);
 
     Ok(topic)
   }

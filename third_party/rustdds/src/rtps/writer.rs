@@ -588,9 +588,8 @@ impl Writer {
     }
   }
 
-  /// Largest serialized payload that fits in one unfragmented DATA submessage
-  /// within the per-peer datagram budget. Fragmentation is triggered only when
-  /// the payload exceeds this, not when it exceeds [`FRAGMENT_SIZE`].
+  /// Largest serialized payload that goes into one unfragmented DATA submessage:
+  /// what fits the per-peer datagram budget, and at least [`FRAGMENT_SIZE`].
   fn max_unfragmented_serialized_payload(
     &self,
     target_reader_opt: Option<&RtpsReaderProxy>,
@@ -601,9 +600,7 @@ impl Writer {
     } else {
       0
     };
-    budget
-      .saturating_sub(hb_reserve)
-      .saturating_sub(DATA_SUBMESSAGE_OVERHEAD)
+    max_unfragmented_payload(budget, hb_reserve)
   }
 
   fn num_frags_and_frag_size(&self, payload_size: usize) -> (u32, u16) {
@@ -2267,6 +2264,16 @@ fn repair_interval_for(deadline: Option<Duration>) -> std::time::Duration {
   }
 }
 
+// A sample that is smaller than a fragment is never sent as DATAFRAG: a fragment
+// size above the data size makes the submessage invalid (RTPS v2.5 Section
+// 8.3.8.3.3), and a fragment of that size would overflow the budget as well.
+fn max_unfragmented_payload(budget: usize, heartbeat_reserve: usize) -> usize {
+  budget
+    .saturating_sub(heartbeat_reserve)
+    .saturating_sub(DATA_SUBMESSAGE_OVERHEAD)
+    .max(FRAGMENT_SIZE)
+}
+
 // Adaptive packing: how many contiguous fragments (starting at 1-based `start`)
 // to place in a single DATAFRAG submessage so the datagram stays within
 // `budget` bytes. `header_len` is the datagram size already committed (RTPS
@@ -2599,7 +2606,22 @@ mod tests {
   use byteorder::LittleEndian;
   use log::info;
 
-  use super::frags_per_datafrag;
+  use super::{frags_per_datafrag, max_unfragmented_payload};
+  use crate::rtps::constant::{payload_budget_for_mtu, FRAGMENT_SIZE};
+
+  #[test]
+  fn a_sample_smaller_than_a_fragment_is_not_fragmented() {
+    for mtu in [0, 576, 1280, 1400, 1407] {
+      assert_eq!(
+        max_unfragmented_payload(payload_budget_for_mtu(mtu), 32),
+        FRAGMENT_SIZE
+      );
+    }
+    assert_eq!(
+      max_unfragmented_payload(payload_budget_for_mtu(1500), 32),
+      1500 - 48 - 32 - 48
+    );
+  }
 
   // At a 1500-byte-MTU budget, a two-fragment "1 KB" sample (its serialized form
   // is slightly over the 1024-byte fragment size) packs BOTH fragments into one

@@ -26,7 +26,8 @@ pub use goals::{
 pub use operator::{Operator, Question};
 pub use planner::{Job, PlannerRules, Prediction, ProposalPlanner};
 pub use tracker::{
-    Capture, CaptureError, Change, ConfirmationRefusal, GoalTracker, NoSuchStep, StepJudge,
+    Capture, CaptureError, Change, ConfirmationRefusal, GoalTracker, NoSuchStep, RefusalKind,
+    StepJudge,
 };
 pub use types::{
     Confirmation, Coverage, Goal, Observation, OperatorDecision, Proposal, ProposalId,

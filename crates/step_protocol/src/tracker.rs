@@ -70,17 +70,60 @@ pub enum ConfirmationRefusal {
 }
 
 impl ConfirmationRefusal {
-    /// The constant of the message `ConfirmationRefused`.
-    pub const fn code(&self) -> u8 {
+    /// What kind it is.
+    pub const fn kind(&self) -> RefusalKind {
         match self {
-            Self::Unknown { .. } => 1,
-            Self::Stale { .. } => 2,
-            Self::Twice { .. } => 3,
-            Self::Stopped => 4,
-            Self::Complete => 5,
-            Self::NoDecision(_) => 6,
-            Self::NotAsked => 7,
+            Self::Unknown { .. } => RefusalKind::Unknown,
+            Self::Stale { .. } => RefusalKind::Stale,
+            Self::Twice { .. } => RefusalKind::Twice,
+            Self::Stopped => RefusalKind::Stopped,
+            Self::Complete => RefusalKind::Complete,
+            Self::NoDecision(_) => RefusalKind::NoDecision,
+            Self::NotAsked => RefusalKind::NotAsked,
         }
+    }
+}
+
+/// Kinds of a [`ConfirmationRefusal`].
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
+#[repr(u8)]
+pub enum RefusalKind {
+    /// No such proposal for the present goal.
+    Unknown = 1,
+    /// It belongs to a goal that is past.
+    Stale = 2,
+    /// Another decision on the proposal waits for its result.
+    Twice = 3,
+    /// The run was stopped.
+    Stopped = 4,
+    /// All steps are done.
+    Complete = 5,
+    /// A number that stands for no decision.
+    NoDecision = 6,
+    /// The tracker does not wait for an operator.
+    NotAsked = 7,
+}
+
+impl RefusalKind {
+    /// All of them, in the order of their codes.
+    pub const ALL: [Self; 7] = [
+        Self::Unknown,
+        Self::Stale,
+        Self::Twice,
+        Self::Stopped,
+        Self::Complete,
+        Self::NoDecision,
+        Self::NotAsked,
+    ];
+
+    /// The constant of the message `ConfirmationRefused`.
+    pub const fn code(self) -> u8 {
+        self as u8
+    }
+
+    /// The kind of a constant of the message `ConfirmationRefused`.
+    pub fn from_code(code: u8) -> Option<Self> {
+        Self::ALL.into_iter().find(|kind| kind.code() == code)
     }
 }
 

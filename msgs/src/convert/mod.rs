@@ -25,8 +25,8 @@ pub use motion::{
 };
 pub use preview::{compressed_preview, grid_map, points, preview_image};
 pub use step::{
-    confirmation_from_msg, confirmation_refused_to_msg, confirmation_to_msg, goal_from_msg,
-    goal_to_msg, observation_from_msg, proposal_from_msg, proposal_to_msg, result_from_msg,
-    result_to_msg, reward_from_msg,
+    confirmation_from_msg, confirmation_refused_from_msg, confirmation_refused_to_msg,
+    confirmation_to_msg, goal_from_msg, goal_to_msg, observation_from_msg, proposal_from_msg,
+    proposal_to_msg, result_from_msg, result_to_msg, reward_from_msg,
 };
 pub use time::{duration_from_msg, duration_to_msg, time_from_msg, time_to_msg};

@@ -12,7 +12,7 @@ use std::sync::Arc;
 use std::time::Duration;
 use step_protocol::{
     Confirmation, ConfirmationRefusal, Coverage, Goal, Observation, OperatorDecision, Proposal,
-    ProposalId, ProposalStatus, Reward, StepOutcome, StepResult,
+    ProposalId, ProposalStatus, RefusalKind, Reward, StepOutcome, StepResult,
 };
 
 /// What is wrong with a part of a message.
@@ -195,6 +195,16 @@ pub fn reward_from_msg(msg: &sctn_msgs::Reward) -> Result<Reward, ConvertError> 
     })
 }
 
+/// Which proposal the refused confirmation named, and of what kind the refusal is; none is a kind of a later version.
+pub fn confirmation_refused_from_msg(
+    msg: &sctn_msgs::ConfirmationRefused,
+) -> (ProposalId, Option<RefusalKind>) {
+    (
+        ProposalId(msg.proposal_id),
+        RefusalKind::from_code(msg.reason),
+    )
+}
+
 /// Why a confirmation changed nothing.
 pub fn confirmation_refused_to_msg(
     proposal_id: ProposalId,
@@ -208,7 +218,7 @@ pub fn confirmation_refused_to_msg(
             frame_id: frame.to_owned(),
         },
         proposal_id: proposal_id.0,
-        reason: refusal.code(),
+        reason: refusal.kind().code(),
         message: refusal.to_string(),
     })
 }

@@ -1,59 +1,44 @@
-//! Node that serves the operator's page: see, approve and stop a run in a browser.
-//!
-//! `run::Run` is what the operator sees, `session::Sessions` who watches and who decides; neither knows ROS
-//! node, clock or network.
+//! Node that serves the operator's page: see, approve and stop a run in a browser. What the page shows and decides is the
+//! library `console`; here messages are converted and commands carried out.
 
 mod cameras;
-mod checkpoints;
-mod console;
-mod history;
-mod lesson;
-mod library;
+mod commands;
+mod convert;
 mod parameters;
-mod preview;
-mod refusal;
-mod run;
-mod server;
-mod session;
-mod tls;
-mod training;
 
 use std::fs::OpenOptions;
 use std::io::Write as _;
 use std::os::unix::fs::OpenOptionsExt as _;
-use std::path::{Path, PathBuf};
+use std::path::Path;
 use std::pin::Pin;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
 use anyhow::Context as _;
-use bags::Demonstration;
-use msgs::convert;
+use console::{
+    Access, Cameras, Checkpoints, Console, Libraries, Listener, Page, Phase, Run, Sessions,
+    TlsAcceptor, Trainings, Watch,
+};
+use msgs::convert::{
+    confirmation_from_msg, confirmation_refused_from_msg, goal_from_msg, observation_from_msg,
+    proposal_from_msg, result_from_msg, reward_from_msg,
+};
 use msgs::diagnostic_msgs::DiagnosticArray;
 use msgs::sctn_msgs::{
-    ConfirmationRefused, Goal, Heightmap, LoadCheckpoint, LoadCheckpointRequest, LoadDemonstration,
-    LoadDemonstrationRequest, OperatorPresence, PickPlace, PlannedMotion, ProposeHome,
-    ProposeHomeRequest, Reward, SetStep, SetStepRequest, StepConfirmation, StepResult,
+    ConfirmationRefused, Goal, Heightmap, PickPlace, PlannedMotion, Reward, StepConfirmation,
+    StepResult,
 };
 use msgs::sensor_msgs::{Image, JointState};
-use msgs::std_msgs::{self, Bool, Float64, Header};
+use msgs::std_msgs::{self, Bool, Float64};
 use msgs::ur_dashboard_msgs::{RobotMode, SafetyMode};
-use msgs::ur_msgs::{Digital, IOStates};
-use node_kit::{Active, CallOptions, Level, Node, Publisher, Qos, ServiceClient};
+use msgs::ur_msgs::IOStates;
+use node_kit::{Active, Level, Node, Qos};
 use tokio::time::MissedTickBehavior;
-use tokio_rustls::TlsAcceptor;
 use tokio_util::sync::CancellationToken;
 use tracing::{info, warn};
 
-use crate::cameras::Cameras;
-use crate::checkpoints::Checkpoints;
-use crate::console::{Command, Console, PolicyState};
-use crate::library::Libraries;
-use crate::run::{Phase, Run, Watch};
-use crate::server::Access;
-use crate::session::Sessions;
-use crate::tls::Listener;
-use crate::training::Trainings;
+use crate::commands::{Commands, show_demonstration};
+use crate::convert::{joints_from_msg, level, motion_from_msg, report_from_msg, scores_from_msg};
 
 pub use parameters::{OperatorConsoleParameters, Tls};
 
@@ -61,19 +46,6 @@ pub use parameters::{OperatorConsoleParameters, Tls};
 const PRESENCE_PERIOD: Duration = Duration::from_millis(200);
 /// Joint states are taken over at most this often: a UR5 sends 500 a second.
 const JOINTS_PERIOD: Duration = Duration::from_millis(100);
-const CHOOSE_ANOTHER: &str =
-    "Choose another demonstration, or look whether the goal oracle is at work.";
-/// How long the plan of the way home may take.
-const HOME_TIMEOUT: CallOptions = CallOptions {
-    attempts: 1,
-    timeout: Duration::from_secs(60),
-};
-
-/// A secret of 256 random bits, for tokens and sessions.
-pub(crate) fn secret() -> String {
-    let bytes: [u8; 32] = rand::random();
-    bytes.iter().map(|byte| format!("{byte:02x}")).collect()
-}
 
 /// Reads certificate and key; what it returns serves the page while it is active.
 pub async fn configure(
@@ -81,10 +53,13 @@ pub async fn configure(
     parameters: OperatorConsoleParameters,
 ) -> anyhow::Result<ConsoleNode> {
     let tls = match parameters.has_tls() {
-        true => Some(tls::acceptor(
-            &parameters.tls.certificate,
-            &parameters.tls.key,
-        )?),
+        true => {
+            let Tls { certificate, key } = &parameters.tls;
+            Some(
+                console::tls_acceptor(certificate, key)
+                    .context("parameters tls.certificate and tls.key")?,
+            )
+        }
         false => None,
     };
     let watch = Watch {
@@ -103,35 +78,28 @@ pub async fn configure(
     };
     let session_timeout = Duration::from_secs_f64(parameters.session_timeout_s);
     let sessions = Sessions::new(parameters.max_viewers, session_timeout);
-    Ok(ConsoleNode {
-        confirmations: node.publisher("step_confirmation", Qos::Event)?,
-        proposals: node.publisher("pick_place", Qos::Latched)?,
-        presence: node.publisher("operator_presence", Qos::Event)?,
-        home: Arc::new(node.service_client(&format!("{}/propose_home", parameters.executor))?),
-        set_step: Arc::new(node.service_client(&format!("{}/set_step", parameters.goal_oracle))?),
-        load: Arc::new(
-            node.service_client(&format!("{}/load_demonstration", parameters.goal_oracle))?,
-        ),
+    let checkpoints = [parameters.checkpoints.clone(), parameters.training.clone()];
+    let trainings = Trainings::new(
+        parameters.sctn.clone(),
+        parameters.recipe.clone(),
+        parameters.training.clone(),
+        parameters.checkpoint.clone(),
+    );
+    let cameras = Cameras::new(&parameters.cameras, &parameters.world_frame);
+    let page = Page {
+        console: Arc::new(Console::new(Run::new(watch), sessions)),
         libraries: Arc::new(Libraries::new(&parameters.library)),
-        checkpoints: Arc::new(Checkpoints::new([
-            parameters.checkpoints.clone(),
-            parameters.training.clone(),
-        ])),
-        trainings: Arc::new(Trainings::new(
-            parameters.sctn.clone(),
-            parameters.recipe.clone(),
-            parameters.training.clone(),
-            parameters.checkpoint.clone(),
-        )),
-        load_checkpoint: Arc::new(
-            node.service_client(&format!("{}/load_checkpoint", parameters.policy))?,
-        ),
-        cameras: Arc::new(Cameras::new(&parameters.cameras, &parameters.world_frame)),
+        checkpoints: Arc::new(Checkpoints::new(checkpoints)),
+        trainings: Arc::new(trainings),
+        cameras: Arc::new(cameras),
+    };
+    Ok(ConsoleNode {
+        commands: Commands::new(&node, &parameters, page.clone())?,
         token: match parameters.token.as_str() {
-            "" => secret(),
+            "" => console::secret(),
             token => token.to_owned(),
         },
-        console: Arc::new(Console::new(Run::new(watch), sessions)),
+        page,
         tls,
         parameters,
     })
@@ -142,33 +110,24 @@ pub struct ConsoleNode {
     parameters: OperatorConsoleParameters,
     token: String,
     tls: Option<TlsAcceptor>,
-    console: Arc<Console>,
-    confirmations: Publisher<StepConfirmation>,
-    proposals: Publisher<PickPlace>,
-    presence: Publisher<OperatorPresence>,
-    home: Arc<ServiceClient<ProposeHome>>,
-    set_step: Arc<ServiceClient<SetStep>>,
-    load: Arc<ServiceClient<LoadDemonstration>>,
-    libraries: Arc<Libraries>,
-    checkpoints: Arc<Checkpoints>,
-    trainings: Arc<Trainings>,
-    load_checkpoint: Arc<ServiceClient<LoadCheckpoint>>,
-    cameras: Arc<Cameras>,
+    page: Page,
+    commands: Commands,
 }
 
 impl Active for ConsoleNode {
     async fn run(&mut self, node: &Node) -> anyhow::Result<()> {
-        let mut commands = self.console.connect();
+        let console = Arc::clone(&self.page.console);
+        let mut commands = console.connect();
         let end = CancellationToken::new();
         let _ended = end.clone().drop_guard();
         if self.parameters.demonstration != Path::new("") {
             let path = self.parameters.demonstration.clone();
-            show_demonstration(node, &self.console, path).await;
+            show_demonstration(node, &console, path).await;
         }
-        let libraries = Arc::clone(&self.libraries);
+        let libraries = Arc::clone(&self.page.libraries);
         let open_run = node.spawn_blocking(move || libraries.history.open_run());
         if let Some(run) = open_run.await.context("reading the history panicked")? {
-            self.console.change(|state, _| state.resume_run(run));
+            console.change(|state, _| state.resume_run(run));
         }
         self.serve(node, &end).await?;
         self.follow_cameras(node, &end);
@@ -197,7 +156,6 @@ impl Active for ConsoleNode {
         let mut scores = node.subscription::<Image>("pick_place/scores", Qos::Latched)?;
         let mut descriptions =
             node.subscription::<std_msgs::String>("robot_description", Qos::Latched)?;
-        let console = Arc::clone(&self.console);
         let mut joints_taken: Option<Instant> = None;
         let mut presence = tokio::time::interval(PRESENCE_PERIOD);
         presence.set_missed_tick_behavior(MissedTickBehavior::Delay);
@@ -205,66 +163,68 @@ impl Active for ConsoleNode {
             tokio::select! {
                 // What an operator has decided goes before what is shown.
                 biased;
-                _ = presence.tick() => self.publish_presence(node),
-                Some(command) = commands.recv() => self.carry_out(node, command),
-                message = heightmaps.recv() => {
-                    if let Err(reason) = console.change(|state, now| state.on_heightmap(message, now)) {
-                        heightmaps.reject(reason);
-                    }
-                }
+                _ = presence.tick() => self.commands.publish_presence(node),
+                Some(command) = commands.recv() => self.commands.carry_out(node, command),
+                message = heightmaps.recv() => match observation_from_msg(message) {
+                    Ok(seen) => console.change(|state, now| state.on_heightmap(seen, now)),
+                    Err(error) => heightmaps.reject(error),
+                },
                 message = goals.recv() => {
-                    if let Err(reason) = console.change(|state, now| state.on_goal(message, now)) {
-                        goals.reject(reason);
+                    let goal = goal_from_msg(message).map_err(anyhow::Error::from);
+                    let shown = goal.and_then(|goal| Ok(console.change(|state, now| state.on_goal(goal, now))?));
+                    if let Err(error) = shown {
+                        goals.reject(error);
                     }
                 }
                 message = proposals.recv() => {
-                    if let Err(reason) = console.change(|state, now| state.on_proposal(message, now)) {
-                        proposals.reject(reason);
+                    let proposal = proposal_from_msg(&message).map_err(anyhow::Error::from);
+                    let shown = proposal
+                        .and_then(|proposal| Ok(console.change(|state, now| state.on_proposal(proposal, now))?));
+                    if let Err(error) = shown {
+                        proposals.reject(error);
                     }
                 }
-                message = confirmations.recv() => console.change(|state, now| state.on_confirmation(&message, now)),
-                message = results.recv() => {
-                    if let Err(reason) = console.change(|state, now| state.on_result(&message, now)) {
-                        results.reject(reason);
-                    }
-                }
-                message = motions.recv() => {
-                    if let Err(reason) = console.change(|state, now| state.on_planned_motion(message, now)) {
-                        motions.reject(reason);
-                    }
-                }
-                message = scores.recv() => {
-                    if let Err(reason) = console.change(|state, _| state.run.on_scores(message)) {
-                        scores.reject(reason);
-                    }
-                }
+                message = confirmations.recv() => match confirmation_from_msg(&message) {
+                    Ok(confirmation) => console.change(|state, now| state.on_confirmation(&confirmation, now)),
+                    Err(refusal) => confirmations.reject(refusal),
+                },
+                message = results.recv() => match result_from_msg(&message) {
+                    Ok(result) => console.change(|state, now| state.on_result(&result, now)),
+                    Err(error) => results.reject(error),
+                },
+                message = motions.recv() => match motion_from_msg(message) {
+                    Ok(motion) => console.change(|state, now| state.on_planned_motion(motion, now)),
+                    Err(error) => motions.reject(error),
+                },
+                message = scores.recv() => match scores_from_msg(message) {
+                    Ok(scores) => console.change(|state, _| state.run.on_scores(scores)),
+                    Err(error) => scores.reject(error),
+                },
                 message = descriptions.recv() => {
-                    if let Err(reason) = console.change(|state, _| state.run.on_robot_description(message.data)) {
-                        descriptions.reject(reason);
+                    if let Err(error) = console.change(|state, _| state.run.on_robot_description(message.data)) {
+                        descriptions.reject(error);
                     }
                 }
                 message = refused.recv() => {
-                    console.change(|state, now| state.run.on_confirmation_refused(&message, now));
+                    let (id, kind) = confirmation_refused_from_msg(&message);
+                    console.change(|state, now| state.run.on_confirmation_refused(id, kind, &message.message, now));
                 }
-                message = rewards.recv() => console.change(|state, _| state.run.on_reward(message)),
+                message = rewards.recv() => match reward_from_msg(&message) {
+                    Ok(reward) => console.change(|state, _| state.run.on_reward(reward)),
+                    Err(error) => rewards.reject(error),
+                },
                 message = diagnostics.recv() => {
-                    console.change_quietly(|state, now| state.run.on_diagnostics(message, now));
+                    let reports = message.status.into_iter().filter_map(report_from_msg);
+                    console.change_quietly(|state, now| {
+                        reports.for_each(|report| state.run.on_report(report, now));
+                    });
                 }
                 message = joints.recv() => {
                     if joints_taken.is_none_or(|taken| taken.elapsed() >= JOINTS_PERIOD) {
                         joints_taken = Some(Instant::now());
-                        let JointState { name, position, .. } = message;
-                        if name.len() != position.len() || name.len() > 64 {
-                            joints.reject(format_args!(
-                                "{} names and {} positions, expected as many of each, at most 64", name.len(), position.len()
-                            ));
-                            continue;
-                        }
-                        let change = |state: &mut console::State, now| state.run.on_joints(name, position, now);
-                        // Viewers see the arm move.
-                        match console.read(|state, _| state.run.phase()) {
-                            Phase::Moving => console.change(change),
-                            _ => console.change_quietly(change),
+                        match joints_from_msg(message) {
+                            Ok((names, positions_rad)) => show_joints(&console, names, positions_rad),
+                            Err(error) => joints.reject(error),
                         }
                     }
                 }
@@ -292,6 +252,15 @@ impl Active for ConsoleNode {
                 }
             }
         }
+    }
+}
+
+/// Viewers see the arm move.
+fn show_joints(console: &Console, names: Vec<String>, positions_rad: Vec<f64>) {
+    let change = |state: &mut console::State, now| state.run.on_joints(names, positions_rad, now);
+    match console.read(|state, _| state.run.phase()) {
+        Phase::Moving => console.change(change),
+        _ => console.change_quietly(change),
     }
 }
 
@@ -326,15 +295,7 @@ impl ConsoleNode {
             &self.parameters.host_names,
             tls,
         );
-        let router = server::router(
-            Arc::clone(&self.console),
-            Arc::clone(&self.libraries),
-            Arc::clone(&self.checkpoints),
-            Arc::clone(&self.trainings),
-            Arc::clone(&self.cameras),
-            access,
-            end.clone(),
-        );
+        let router = console::router(self.page.clone(), access, end.clone());
         let ended = end.clone().cancelled_owned();
         tokio::spawn(async move {
             let served = axum::serve(listener, router).with_graceful_shutdown(ended);
@@ -356,7 +317,7 @@ impl ConsoleNode {
                     }
                 });
             };
-        let cameras = || Arc::clone(&self.cameras);
+        let cameras = || Arc::clone(&self.page.cameras);
         let transforms = cameras::follow_transforms(node.clone(), cameras());
         watch(
             "a proposal on the cameras' images".to_owned(),
@@ -372,217 +333,6 @@ impl ConsoleNode {
             watch(format!("camera {name}"), Box::pin(images));
         }
     }
-
-    fn publish_presence(&self, node: &Node) {
-        let mut message = self.console.read(|state, now| {
-            let (name, is_present) = state.sessions.presence(now).unwrap_or(("", false));
-            OperatorPresence {
-                operator_name: name.to_owned(),
-                is_present,
-                ..OperatorPresence::default()
-            }
-        });
-        message.header.stamp = node.now();
-        self.presence.publish(message);
-    }
-
-    fn carry_out(&self, node: &Node, command: Command) {
-        match command {
-            Command::Confirm(mut confirmation) => {
-                confirmation.header.stamp = node.now();
-                let StepConfirmation {
-                    proposal_id,
-                    decision,
-                    operator_name,
-                    ..
-                } = &confirmation;
-                info!("`{operator_name}`: decision {decision} on proposal {proposal_id}");
-                self.publish_presence(node);
-                self.confirmations.publish(confirmation);
-            }
-            Command::Propose(proposal) => {
-                info!("an operator's proposal {}", proposal.id);
-                self.proposals.publish(*proposal);
-            }
-            Command::Home(name) => {
-                info!("`{name}` asks for the way home");
-                self.publish_presence(node);
-                let (client, console) = (Arc::clone(&self.home), Arc::clone(&self.console));
-                node.spawn(async move {
-                    // The executor has to hear that the operator is present before the call, also where they have just taken control.
-                    tokio::time::sleep(PRESENCE_PERIOD).await;
-                    let answer = client
-                        .call(&ProposeHomeRequest::default(), &HOME_TIMEOUT)
-                        .await;
-                    let reason = match answer {
-                        Ok(answer) if answer.success => {
-                            let (id, asks) = (answer.proposal_id, answer.needs_approval);
-                            return console.change(|state, _| state.on_home(id, asks));
-                        }
-                        Ok(answer) => answer.message,
-                        Err(error) => error.to_string(),
-                    };
-                    let advice = refusal::advice(&reason);
-                    let text = format!("There is no way home: {reason}");
-                    console.change(|state, now| state.run.note("refusal", text, advice, now));
-                });
-            }
-            Command::Load(demonstration, path, name) => {
-                info!("`{name}`: repeat {}", path.display());
-                let (client, console) = (Arc::clone(&self.load), Arc::clone(&self.console));
-                let request = LoadDemonstrationRequest {
-                    request_id: secret(),
-                    path: path.display().to_string(),
-                };
-                let shown = node.clone();
-                node.spawn(async move {
-                    let goals = show_demonstration(&shown, &console, path).await;
-                    let answer = client.call(&request, &CallOptions::default()).await;
-                    let (kind, reason, advice) = match answer {
-                        Ok(answer) if answer.success => {
-                            if let Some(goals) = goals {
-                                console.change(|state, _| state.on_loaded(demonstration, goals));
-                            }
-                            ("note", format!("The run repeats {}.", answer.message), "")
-                        }
-                        Ok(answer) => (
-                            "refusal",
-                            format!("The demonstration was not loaded: {}", answer.message),
-                            CHOOSE_ANOTHER,
-                        ),
-                        Err(error) => (
-                            "refusal",
-                            format!("The demonstration was not loaded: {error}"),
-                            CHOOSE_ANOTHER,
-                        ),
-                    };
-                    console.change(|state, now| state.run.note(kind, reason, advice, now));
-                });
-            }
-            Command::LoadCheckpoint(path, name) => {
-                info!("`{name}`: checkpoint {}", path.display());
-                let client = Arc::clone(&self.load_checkpoint);
-                let trainings = Arc::clone(&self.trainings);
-                let console = Arc::clone(&self.console);
-                let request = LoadCheckpointRequest {
-                    request_id: secret(),
-                    path: path.display().to_string(),
-                };
-                node.spawn(async move {
-                    let answer = client.call(&request, &CallOptions::default()).await;
-                    console.change(|state, now| {
-                        let refused = match answer {
-                            Ok(answer) if answer.success => {
-                                let shown = path.file_stem().unwrap_or_default().to_string_lossy();
-                                let reason =
-                                    format!("The policy uses {shown} from its next proposal on.");
-                                state.run.note("note", reason, "", now);
-                                trainings.begin_with(&answer.path);
-                                state.policy = Some(PolicyState {
-                                    checkpoint: answer.path,
-                                    previous: answer.previous,
-                                });
-                                return;
-                            }
-                            Ok(answer) => answer.message,
-                            Err(error) => error.to_string(),
-                        };
-                        let reason = format!("The policy has kept its checkpoint: {refused}.");
-                        let advice =
-                            "Choose another checkpoint, or look whether the policy is at work.";
-                        state.run.note("refusal", reason, advice, now);
-                    });
-                });
-            }
-            Command::Record(event) => {
-                let libraries = Arc::clone(&self.libraries);
-                self.write(node, "how a run went", move || {
-                    libraries
-                        .history
-                        .add(event)
-                        .map_err(|error| error.to_string())
-                });
-            }
-            Command::Keep(correction) => {
-                let libraries = Arc::clone(&self.libraries);
-                let (name, demonstration) = *correction;
-                info!("correction {name}");
-                self.write(node, "a correction", move || {
-                    let saved = libraries.corrections.save(&name, &demonstration);
-                    saved.map_err(|refusal| refusal.reason)
-                });
-            }
-            Command::SetStep(step, name) => {
-                info!("`{name}`: continue with step {step}");
-                let (client, console) = (Arc::clone(&self.set_step), Arc::clone(&self.console));
-                let request = SetStepRequest {
-                    request_id: secret(),
-                    step,
-                };
-                node.spawn(async move {
-                    let reason = match client.call(&request, &CallOptions::default()).await {
-                        Ok(answer) if answer.success => return,
-                        Ok(answer) => answer.message,
-                        Err(error) => error.to_string(),
-                    };
-                    console.change(|state, now| {
-                        let advice = "Look whether the goal oracle is at work.";
-                        let reason = format!("The run did not continue: {reason}");
-                        state.run.note("refusal", reason, advice, now);
-                    });
-                });
-            }
-        }
-    }
-}
-
-impl ConsoleNode {
-    /// Writes something of the library on a thread of its own; viewers are told.
-    fn write(
-        &self,
-        node: &Node,
-        what: &'static str,
-        write: impl FnOnce() -> Result<(), String> + Send + 'static,
-    ) {
-        let console = Arc::clone(&self.console);
-        node.spawn_blocking(move || match write() {
-            Ok(()) => console.change(|state, _| state.library_changed()),
-            Err(error) => {
-                warn!("{what} was not kept: {error}");
-                let reason =
-                    format!("What was learned from the run was not kept ({what}): {error}");
-                let advice = "Look at the parameter library and at the disk.";
-                console.change(|state, now| state.run.note("fault", reason, advice, now));
-            }
-        });
-    }
-}
-
-/// Name and goal images of a demonstration.
-fn read_demonstration(path: &Path) -> anyhow::Result<(String, Vec<Heightmap>)> {
-    let demonstration = Demonstration::read(path)?;
-    let image = |heightmap: &heightmap::Heightmap| {
-        convert::heightmap_to_msg(heightmap.clone(), Header::default(), 0, 0.0)
-    };
-    let images = demonstration.goals().into_iter().map(image);
-    Ok((demonstration.name(), images.collect::<Result<_, _>>()?))
-}
-
-/// Shows the images of a demonstration before they are latched. Returns its name in the goals; nothing where it cannot be read.
-async fn show_demonstration(node: &Node, console: &Console, path: PathBuf) -> Option<String> {
-    let reading = path.clone();
-    let read = node.spawn_blocking(move || read_demonstration(&reading));
-    match read.await.context("reading panicked").flatten() {
-        Ok((name, images)) => {
-            let shown = name.clone();
-            console.change(|state, now| state.run.on_demonstration(shown, images, now));
-            Some(name)
-        }
-        Err(error) => {
-            warn!("demonstration {}: {error:#}", path.display());
-            None
-        }
-    }
 }
 
 /// Whole or not at all, for the owner alone: it holds the token.
@@ -595,11 +345,4 @@ fn write_address(path: &Path, page: &str) -> anyhow::Result<()> {
     let mut file = options.open(&partial).with_context(shown)?;
     writeln!(file, "{page}").with_context(shown)?;
     std::fs::rename(&partial, path).with_context(shown)
-}
-
-fn level(states: &[Digital], pin: u8) -> Option<bool> {
-    let mut states = states.iter();
-    states
-        .find(|state| state.pin == pin)
-        .map(|state| state.state)
 }

@@ -20,17 +20,17 @@ use msgs::ur_dashboard_msgs::{RobotMode, SafetyMode};
 use msgs::ur_msgs::{FollowJointTrajectoryUntil, IOStates, SetIORequest, ToolDataMsg};
 use multiravens::Problem;
 use node_kit::{NewGoal, Node, Publisher, Qos, ReplyCache};
+use simulated_cell::{Pins, SimulatedCell};
 use tokio::sync::oneshot;
 use tracing::{info, warn};
 use ur5::WorkCell;
 
 use self::goal::Activity;
 use self::reports::fixed_transforms;
-use crate::driver::{follow_trajectory, path_tolerances, until_trajectory};
+use crate::driver::{follow_trajectory, output_from_msg, path_tolerances, until_trajectory};
 use crate::frames::{CameraTopics, Frame};
 use crate::node::{Command, Shared, controller_of};
 use crate::parameters::SimWorkcellParameters;
-use crate::simulated_cell::SimulatedCell;
 
 /// Detects contact; only robots with software 5 or later have it.
 const TOOL_CONTACT: &str = "tool_contact_controller";
@@ -84,7 +84,7 @@ pub(crate) struct Hardware {
     /// Sets taken of noisy cameras so far.
     sets_taken: u64,
     resets: ReplyCache<ResetCellResponse>,
-    published_pins: IOStates,
+    published_pins: Pins,
     /// When the last command ended.
     last_command: Instant,
     next_status: Instant,
@@ -142,7 +142,7 @@ impl Hardware {
             io_states: node.publisher(&status("io_states"), Qos::Event)?,
             reward: node.publisher("reward", Qos::Event)?,
             node: node.clone(),
-            published_pins: cell.io_states(),
+            published_pins: cell.pins(),
             problem: parameters.problem.clone(),
             parameters,
             cell,
@@ -382,14 +382,15 @@ impl Hardware {
     }
 
     fn set_io(&mut self, request: &SetIORequest, reply: oneshot::Sender<bool>) {
-        let done = self.cell.set_io(request);
-        if let Err(reason) = &done {
-            warn!("set_io: {reason}");
+        let output = output_from_msg(request);
+        match &output {
+            Ok(output) => self.cell.set(*output),
+            Err(reason) => warn!("set_io: {reason}"),
         }
         // The new state is out before the reply is.
         self.publish_changed_pins();
         // The caller may have gone.
-        let _ = reply.send(done.is_ok());
+        let _ = reply.send(output.is_ok());
     }
 
     /// Time of the wall clock, from an origin of its own.

@@ -9,7 +9,6 @@ pub mod frames;
 mod hardware;
 mod node;
 mod parameters;
-mod simulated_cell;
 
 pub use node::{HardwareNode, configure};
 pub use parameters::SimWorkcellParameters;

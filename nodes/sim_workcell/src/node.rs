@@ -20,13 +20,13 @@ use msgs::ur_msgs::{
 };
 use multiravens::Problem;
 use node_kit::{Active, NewGoal, Node};
+use simulated_cell::{SimulatedCell, Wiring};
 use tokio::sync::oneshot;
 use tracing::{error, warn};
 use ur5::WorkCell;
 
 use crate::hardware::Hardware;
 use crate::parameters::SimWorkcellParameters;
-use crate::simulated_cell::{SimulatedCell, Wiring};
 
 /// Commands that wait for the hardware's thread; more are refused.
 const WAITING_COMMANDS: usize = 64;

@@ -6,6 +6,7 @@ use std::time::{Duration, Instant};
 use msgs::control_msgs::FollowJointTrajectoryResult;
 use msgs::sctn_msgs::Reward;
 use multiravens::MotionEnd;
+use simulated_cell::Step;
 use tracing::{error, info, warn};
 use ur5::{JointTrajectory, Joints};
 
@@ -13,7 +14,6 @@ use super::Hardware;
 use super::goal::{Activity, End, withdrawn};
 use crate::driver::Failure;
 use crate::node::Command;
-use crate::simulated_cell::Step;
 
 /// The most that simulated time catches up at once.
 const MOST_CATCH_UP: Duration = Duration::from_millis(200);
@@ -31,8 +31,10 @@ impl Hardware {
     ) -> anyhow::Result<()> {
         // Where the arm still brakes, it brakes no longer.
         self.cell.halt();
-        let begun = trajectory
-            .and_then(|trajectory| self.cell.begin(trajectory, until_contact, tolerances));
+        let begun = trajectory.and_then(|trajectory| {
+            let begun = self.cell.begin(trajectory, until_contact, tolerances);
+            begun.map_err(|error| Failure::goal(error.to_string()))
+        });
         if let Err(failure) = begun {
             warn!("goal aborted: {failure}");
             goal.end(End::Failed(failure));
@@ -105,7 +107,7 @@ impl Hardware {
         // A host that is behind catches up little by little.
         let due = (self.origin.1 + now).min(self.cell.time() + MOST_CATCH_UP);
         while self.cell.time() < due {
-            self.cell.pass_time(now).map_err(anyhow::Error::msg)?;
+            self.cell.pass_time(now)?;
         }
         Ok(())
     }

@@ -9,14 +9,16 @@ use msgs::std_msgs::{Bool, Float64, Header};
 use msgs::tf2_msgs::TFMessage;
 use msgs::trajectory_msgs::JointTrajectoryPoint;
 use msgs::ur_dashboard_msgs::{RobotMode, SafetyMode};
+use msgs::ur_msgs::ToolDataMsg;
+use simulated_cell::SimulatedCell;
 
 use super::Hardware;
 use super::goal::Activity;
 use ur5::WorkCell;
 
+use crate::driver::pins_to_msg;
 use crate::frames::{camera_transforms, link_transforms};
 use crate::parameters::SimWorkcellParameters;
-use crate::simulated_cell::SimulatedCell;
 
 /// Who commands reads the status; once nobody has for so long, it is repeated less often.
 const ATTENTIVE: Duration = Duration::from_secs(1);
@@ -103,16 +105,20 @@ impl Hardware {
         if self.is_dead() {
             return;
         }
-        self.tool_data.publish(self.cell.tool_data());
+        self.tool_data.publish(ToolDataMsg {
+            tool_output_voltage: self.cell.tool_voltage(),
+            tool_mode: ToolDataMsg::TOOL_RUNNING_MODE,
+            ..Default::default()
+        });
         let percent = 100.0 * self.parameters.hardware.speed_scaling;
         self.speed_scaling.publish(Float64 { data: percent });
-        self.published_pins = self.cell.io_states();
-        self.io_states.publish(self.published_pins.clone());
+        self.published_pins = self.cell.pins();
+        self.io_states.publish(pins_to_msg(&self.published_pins));
         self.next_pins = self.after(self.status_period_s());
     }
 
     pub(super) fn publish_changed_pins(&mut self) {
-        if self.cell.io_states() != self.published_pins {
+        if self.cell.pins() != self.published_pins {
             self.publish_pins();
         }
     }

@@ -1,0 +1,106 @@
+//! Heightmaps as they came, and how the table has changed since one of them.
+
+use std::sync::Arc;
+use std::time::Duration;
+
+use heightmap::{Change, ChangeRules, Heightmap, largest_change};
+use nalgebra::Point2;
+use step_protocol::{Coverage, Observation};
+
+use super::Run;
+
+/// A heightmap with its number: the n-th that came.
+#[derive(Clone, Debug)]
+pub struct View {
+    /// Counts from 1.
+    pub number: u64,
+    /// What was seen.
+    pub heightmap: Arc<Heightmap>,
+    /// Capture time.
+    pub stamp: Duration,
+    /// Frame of the heightmap: the world.
+    pub(super) frame: String,
+    pub(super) coverage: Coverage,
+    pub(super) arrived: Duration,
+}
+
+impl View {
+    pub(super) fn new(number: u64, seen: Observation, arrived: Duration) -> Self {
+        Self {
+            number,
+            heightmap: seen.heightmap,
+            stamp: seen.stamp,
+            frame: seen.frame,
+            coverage: seen.coverage,
+            arrived,
+        }
+    }
+
+    /// An image of a demonstration.
+    pub(super) fn of_goal(
+        number: u64,
+        image: Arc<Heightmap>,
+        coverage: Coverage,
+        stamp: Duration,
+        arrived: Duration,
+    ) -> Self {
+        Self {
+            number,
+            heightmap: image,
+            stamp,
+            frame: String::new(),
+            coverage,
+            arrived,
+        }
+    }
+}
+
+/// How the table differs from the heightmap that a proposal was made from.
+#[derive(Clone, Copy, Debug)]
+pub(super) enum TableChange {
+    /// The largest change.
+    Blob(Change),
+    /// The heightmap covers another workspace.
+    Workspace,
+}
+
+impl Run {
+    /// What has changed since the heightmap that the newest proposal was made from.
+    pub(super) fn compare(&mut self) {
+        let (Some(id), Some(newest)) = (self.newest, self.views.back()) else {
+            return;
+        };
+        let rules = &self.watch.changes;
+        let Some(offered) = self
+            .offered
+            .iter_mut()
+            .rfind(|known| known.proposal.id == id)
+        else {
+            return;
+        };
+        let stamp = offered.proposal.stamp;
+        let Some(source) = self.views.iter().rfind(|view| view.stamp == stamp) else {
+            return;
+        };
+        let action = &offered.proposal.action;
+        let around =
+            [&action.pick, &action.place].map(|pose| Point2::from(pose.translation.vector));
+        offered.change = table_change(source, newest, rules, &around);
+    }
+}
+
+/// How the newest heightmap differs from the one that a proposal was made from, as the executor's gate has it.
+fn table_change(
+    source: &View,
+    newest: &View,
+    rules: &ChangeRules,
+    around: &[Point2<f64>],
+) -> Option<TableChange> {
+    if source.stamp == newest.stamp {
+        return None;
+    }
+    match largest_change(&source.heightmap, &newest.heightmap, rules, around) {
+        Ok(change) => change.map(TableChange::Blob),
+        Err(_) => Some(TableChange::Workspace),
+    }
+}

@@ -6,6 +6,8 @@ A cell is the simulated one as hardware behaves, the executor and the watchdog; 
 each other in one cell: the motion that shows that the arm goes on after a fault is the one that the next fault breaks off. The same seed
 draws the same faults at the same moments. Faults of the network need network namespaces; where the machine allows none, they are left out.
 
+--cells runs so many cells side by side, each in a process of its own; faults that are alike follow each other in one.
+
 --planted runs executors with a planted fault instead, and says which of them the monitor catches.
 """
 
@@ -13,11 +15,15 @@ from __future__ import annotations
 
 import argparse
 import collections
+import concurrent.futures
 import dataclasses
 import json
 import pathlib
+import queue
 import random
+import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
 
@@ -45,8 +51,6 @@ WATCH_S = 2.5
 LATEST_S = 9.0
 # Faults that follow each other in one cell.
 FAULTS_OF_A_CELL = 8
-# Among so many those of the same cell come first.
-ROUND = 4 * len(FAULTS)
 
 # Faults planted in the executor: what exposes each, how long after the motion has begun, and what the monitor has to say of it.
 PLANTED = {
@@ -125,9 +129,7 @@ def run_cells(faults: list[Planned], seed: int, until_s: float = float("inf")) -
     """Injects faults, some in each cell, until a monotonic time is over; says each with what came of it on standard error."""
     left = list(faults)
     while left and time.monotonic() < until_s:
-        # Those of the next one's cell first, among the next ones.
         layout = left[0].layout
-        left[:ROUND] = sorted(left[:ROUND], key=lambda planned: planned.layout is not layout)
         waiting, went_on = len(left), ""
         try:
             with working_cell(layout, seed=left[0].number) as bench:
@@ -180,6 +182,45 @@ def summed(lines: list[Injected], faults: int, seed: int) -> dict[str, object]:
     }
 
 
+def run_side_by_side(faults: list[Planned], arguments: list[str], cells: int, until_s: float) -> Iterator[Injected]:
+    """The same with so many cells at a time, each in a process of its own: middleware remembers the network of its process's first cell.
+
+    `arguments`: the command line by which the processes draw the same faults.
+    """
+    shares = [
+        share[first : first + FAULTS_OF_A_CELL]
+        for layout in Layout
+        if (share := [planned for planned in faults if planned.layout is layout])
+        for first in range(0, len(share), FAULTS_OF_A_CELL)
+    ]
+    shares.sort(key=lambda share: share[0].number)
+    lines: queue.SimpleQueue[str | None] = queue.SimpleQueue()
+    failed: list[int] = []
+
+    def run(share: list[Planned]) -> None:
+        minutes = (until_s - time.monotonic()) / 60.0
+        if minutes <= 0.0:
+            return
+        command = [sys.executable, __file__, *arguments, "--minutes", str(minutes), "--lines"]
+        command += ["--numbers", *(str(planned.number) for planned in share)]
+        with subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, text=True) as process:
+            for line in process.stdout:
+                lines.put(line)
+        if process.returncode:
+            failed.append(process.returncode)
+
+    def run_all() -> None:
+        with concurrent.futures.ThreadPoolExecutor(cells) as pool:
+            list(pool.map(run, shares))
+        lines.put(None)
+
+    threading.Thread(target=run_all, daemon=True).start()
+    while (line := lines.get()) is not None:
+        yield Injected(**json.loads(line))
+    if failed:
+        raise SystemExit(f"{len(failed)} of {len(shares)} processes ended with an error: see above")
+
+
 def campaign(
     count: int,
     seed: int,
@@ -187,10 +228,11 @@ def campaign(
     log: pathlib.Path | None = None,
     minutes: float = float("inf"),
     no_network: str = "",
+    cells: int = 1,
 ) -> dict[str, object]:
     """Injects so many faults. With a log, those that are in it are not injected again, and the result is of all of them.
 
-    `no_network`: why faults of the network are left out, if they are.
+    `no_network`: why faults of the network are left out, if they are. `cells`: how many run side by side.
     """
     faults = drawn(count, seed, among)
     done = read_log(log, faults, seed) if log and log.exists() else []
@@ -199,7 +241,9 @@ def campaign(
         print(f"faults of the network are left out: {no_network}", file=sys.stderr, flush=True)
     left_out = {planned.number for planned in faults if no_network and planned.layout is Layout.TWO_HOSTS}
     until_s = time.monotonic() + 60.0 * minutes
-    for line in run_cells([planned for planned in faults if planned.number not in known | left_out], seed, until_s):
+    left = [planned for planned in faults if planned.number not in known | left_out]
+    arguments = ["--faults", str(count), "--seed", str(seed), "--kinds", *(fault.__name__ for fault in among)]
+    for line in run_side_by_side(left, arguments, cells, until_s):
         done.append(line)
         if log:
             with log.open("a") as file:
@@ -262,10 +306,20 @@ def main() -> int:
     names = {fault.__name__: fault for fault in FAULTS}
     parser.add_argument("--kinds", nargs="+", choices=names, default=list(names), metavar="KIND", help=f"only these: {', '.join(names)}")
     parser.add_argument("--minutes", type=float, default=float("inf"), help="end after so long; with --log the next call goes on")
+    parser.add_argument("--cells", type=int, default=1, help="how many cells run side by side; each takes a fifth of a core")
+    parser.add_argument("--numbers", type=int, nargs="+", help="only the faults of these numbers")
+    parser.add_argument("--lines", action="store_true", help="print each fault and what came of it as a line of JSON, and no result")
     parser.add_argument("--planted", action="store_true", help="run executors with planted faults: each has to be caught")
     parser.add_argument("--only", choices=PLANTED, help="with --planted: this fault alone")
     parser.add_argument("--json", action="store_true", help="print the result as one line of JSON")
     given = parser.parse_args()
+    among = [names[name] for name in given.kinds]
+    if given.lines:
+        lossy_link.in_own_network()
+        faults = [planned for planned in drawn(given.faults, given.seed, among) if not given.numbers or planned.number in given.numbers]
+        for line in run_cells(faults, given.seed, time.monotonic() + 60.0 * given.minutes):
+            print(json.dumps(dataclasses.asdict(line)), flush=True)
+        return 0
     if given.planted:
         caught = planted_campaign(given.only)
         missed = [planted for planted, violation in caught.items() if not violation]
@@ -273,9 +327,8 @@ def main() -> int:
         result = {"planted": len(caught), "caught": len(caught) - len(missed), "missed": missed, "unplanted": unplanted}
         failed = bool(missed or unplanted)
     else:
-        no_network = lossy_link.in_own_network()
-        among = [names[name] for name in given.kinds]
-        result = campaign(given.faults, given.seed, among, given.log, given.minutes, no_network)
+        no_network = lossy_link.why_not()
+        result = campaign(given.faults, given.seed, among, given.log, given.minutes, no_network, given.cells)
         failed = bool(result["violations"] or result["hung_runs"])
     print(json.dumps(result) if given.json else "\n".join(f"{name}: {value}" for name, value in result.items()))
     return 1 if failed else 0

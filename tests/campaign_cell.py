@@ -106,9 +106,9 @@ class Bench:
         """The last time before now at which something was done that exposes a fault [s]."""
         return max((time_s for time_s in self.exposed_s if time_s <= now), default=now)
 
-    def stopped(self, limit_s: float) -> None:
+    def stopped(self, limit_s: float, again: bool = False) -> None:
         """From now on the arm has so long to come to rest."""
-        self.monitor.on_stop(time.monotonic(), limit_s)
+        self.monitor.on_stop(time.monotonic(), limit_s, again)
 
     def set_fault(self, fault: str) -> None:
         """Sets what is wrong with the simulated robot."""
@@ -153,6 +153,10 @@ def watch(bench: Bench) -> None:
         if said.decision == StepConfirmation.APPROVE:
             monitor.on_approval(said.proposal_id, said.operator_name)
 
+    def on_confirmation_of_others(said: StepConfirmation) -> None:
+        if said.operator_name != OPERATOR:
+            on_confirmation(said)
+
     def on_result(result: StepResult) -> None:
         if result.outcome not in (StepResult.REFUSED, StepResult.REJECTED):
             monitor.on_end(result.proposal_id, time.monotonic())
@@ -175,7 +179,9 @@ def watch(bench: Bench) -> None:
         node.create_timer(CLOCK_PERIOD_S, lambda: clock.publish(Clock(clock=time_message(time.time() + bench.clock_ahead_s))))
     node.create_subscription(PickPlace, "pick_place", lambda made: monitor.on_proposal(made.id), LATCHED)
     node.create_subscription(PlannedMotion, "planned_motion", on_plan, LATCHED)
-    node.create_subscription(StepConfirmation, "step_confirmation", on_confirmation, EVENT)
+    # An approval counts from when it is given: readings of the arm that it moves may overtake it on its way back.
+    bench.operator.before_confirmation = on_confirmation
+    node.create_subscription(StepConfirmation, "step_confirmation", on_confirmation_of_others, EVENT)
     node.create_subscription(StepResult, "step_result", on_result, EVENT)
     for action in (FOLLOW_ACTION, UNTIL_ACTION):
         node.create_subscription(GoalStatusArray, f"{action}/_action/status", functools.partial(on_goals, action), LATCHED)

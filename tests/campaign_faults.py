@@ -63,7 +63,8 @@ def freeze_driver(bench: Bench) -> None:
     """Simulation and arm are frozen too: what counts is that the arm does not go on when they come back."""
     bench.driver.signal(signal.SIGSTOP)
     bench.operator.spin(FROZEN_S)
-    bench.stopped(REST_S)
+    # The executor has said meanwhile that the motion has failed, and that the arm may still be moving.
+    bench.stopped(REST_S, again=True)
     bench.driver.signal(signal.SIGCONT)
 
 

@@ -48,6 +48,8 @@ class Operator:
     def __init__(self, domain: int, name: str = "operator") -> None:
         # How many nodes have to hear a confirmation; more where the whole graph runs.
         self.listeners = 1
+        # Is called with each confirmation before it is sent.
+        self.before_confirmation: Callable[[StepConfirmation], None] = lambda _: None
         self.received: dict[str, list[Any]] = {topic: [] for topic in TOPICS}
         # What each node says of itself, by name.
         self.states: dict[str, DiagnosticStatus] = {}
@@ -120,6 +122,7 @@ class Operator:
         message = StepConfirmation(proposal_id=proposal_id, decision=decision, operator_name="end-to-end test")
         if self.received["clock"]:
             message.header.stamp = self.newest("clock").clock
+        self.before_confirmation(message)
         self._confirmations.publish(message)
 
     def approve(self, proposal: PickPlace) -> StepResult:

@@ -19,8 +19,9 @@ CANCELED, ABORTED = 5, 6
 LATE_GOAL_S = 0.3
 # ... and by so much: a descent to contact is slow, 0.05 m/s, some 0.1 rad/s.
 LATE_GOAL_RAD = 0.05
-# A driver has accepted by then whatever it was sent before a stop: until_answer_max_s of config/hardware/realistic.yaml, on a busy machine.
-ANSWER_S = 2.3
+# A driver has accepted by then whatever it was sent before a stop: within 2 s, until_answer_max_s of config/hardware/realistic.yaml,
+# after it has reached it, which a driver that stood still or a network that was parted delays by as much.
+ANSWER_S = 4.0
 
 
 class Kind(enum.Enum):
@@ -111,9 +112,12 @@ class Monitor:
             self._stopped_at = None
             self._void = []
 
-    def on_stop(self, now: float, limit_s: float) -> None:
-        """A stop, fault or death: the arm has to rest within the limit, until the next approval."""
-        if self._stopped_at is None:
+    def on_stop(self, now: float, limit_s: float, again: bool = False) -> None:
+        """A stop, fault or death: the arm has to rest within the limit, until the next approval.
+
+        The first counts, unless the arm could not move before: its driver stood still and goes on `again`.
+        """
+        if self._stopped_at is None or again:
             self._stopped_at, self._limit_s, self.rest_after_s = now, limit_s, 0.0
             self._void = []
             self._late_goal_at = None
@@ -147,6 +151,8 @@ class Monitor:
             self._may_be_unanswered = False
             if now - self._stopped_at <= ANSWER_S + OVERTAKING_S:
                 self._late_goal_at, self._late_from = now, self._positions
+                # The first readings of its motion may have overtaken the news of it.
+                self.violations[:] = [found for found in self.violations if not self._is_overtaking(found, now)]
 
     def on_lost_sight(self) -> None:
         """The driver says nothing any more: where the arm has come to rest meanwhile is not known before the next reading."""
@@ -181,6 +187,10 @@ class Monitor:
         if self._late_goal_at is None or now - self._late_goal_at > LATE_GOAL_S + OVERTAKING_S:
             return False
         return self._late_from is None or max(abs(a - b) for a, b in zip(positions, self._late_from, strict=True)) <= LATE_GOAL_RAD
+
+    def _is_overtaking(self, found: Violation, now: float) -> bool:
+        """Whether a violation is a motion that began just before now."""
+        return found.kind in (Kind.AFTER_STOP, Kind.UNAPPROVED) and now - found.at_s <= OVERTAKING_S and self._moving is not None
 
     def _violate(self, kind: Kind, text: str, now: float) -> None:
         self.violations.append(Violation(kind, text, now))

@@ -29,7 +29,10 @@ def why_not() -> str:
     """Why this machine lets us make no second host; empty where it does."""
     if not os.access("/dev/net/tun", os.R_OK | os.W_OK):
         return "/dev/net/tun cannot be opened"
-    tried = subprocess.run([*IN_OWN_NETWORK, "ip", "link", "set", "lo", "up"], capture_output=True, text=True, check=False)
+    try:
+        tried = subprocess.run([*IN_OWN_NETWORK, "ip", "link", "set", "lo", "up"], capture_output=True, text=True, check=False)
+    except FileNotFoundError as error:
+        return f"{error.filename} is not installed"
     return tried.stderr.strip() if tried.returncode else ""
 
 
@@ -37,11 +40,8 @@ def in_own_network() -> str:
     """Starts this process again in a network namespace of its own; where the machine does not allow that, returns why."""
     if os.environ.get(VARIABLE):
         return ""
-    try:
-        if reason := why_not():
-            return reason
-    except FileNotFoundError as error:
-        return f"{error.filename} is not installed"
+    if reason := why_not():
+        return reason
     os.environ[VARIABLE] = "1"
     os.execvp(IN_OWN_NETWORK[0], [*IN_OWN_NETWORK, "sh", "-c", 'ip link set lo up && exec "$@"', "sh", sys.executable, *sys.argv])
 

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-import pathlib
+import json
 import signal
+import subprocess
+import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import numpy as np
 import pytest
@@ -14,23 +16,34 @@ from processes import REPOSITORY
 from sctn_msgs.msg import Heightmap, PickPlace, StepConfirmation, StepResult
 from sctn_msgs.srv import ProposeHome
 from test_refusals import Cell
+from whole_run import parameters
 
-REALISTIC = REPOSITORY / "config/hardware/realistic.yaml"
-DISKS = 9
-# Each step may be tried again a few times: the policy is learned.
-MOST_PROPOSALS = 3 * DISKS
+# Problems, and how many motions each may take: every step may be tried again a few times, the policy is learned.
+WHOLE_RUNS = {"placing": 3 * 9, "stacking": 3 * 6}
 # The way of a cancel and the braking of the arm, which takes 0.15 s.
 REST_AFTER_STOP_S = 0.4
 # The same after the watchdog's timeout.
 REST_AFTER_DEATH_S = 0.6
 
 
-def parameters(node: str, **values: object) -> list[object]:
-    """The arguments of a node of the realistic cell."""
-    arguments: list[object] = ["--ros-args", "--params-file", REPOSITORY / f"config/{node}.yaml", "--params-file", REALISTIC]
-    for name, value in values.items():
-        arguments += ["-p", f"{name.replace('__', '.')}:={value}"]
-    return arguments
+@pytest.fixture(scope="module", autouse=True)
+def whole_runs(request: pytest.FixtureRequest) -> Iterator[dict[str, subprocess.Popen[str]]]:
+    """The whole runs that are asked for, begun before the first test of this file: they take real time, and little of the processor."""
+    whole_run = test_a_whole_run_completes_with_a_driver_as_it_is
+    asked_for = [item.callspec.params["problem"] for item in request.session.items if item.originalname == whole_run.__name__]
+    runs = {}
+    for problem in asked_for:
+        command = [sys.executable, REPOSITORY / "tests/whole_run.py", problem, "10000", str(WHOLE_RUNS[problem])]
+        runs[problem] = subprocess.Popen(
+            command, cwd=REPOSITORY / "tests", stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        )
+    try:
+        yield runs
+    finally:
+        for run in runs.values():
+            # It ends what it has started.
+            run.terminate()
+            run.wait(30.0)
 
 
 @pytest.fixture
@@ -227,43 +240,6 @@ def test_a_second_executor_does_not_become_active(cell: Cell, start) -> None:
     wait_until_moving(cell)
 
 
-def test_placing_completes_with_a_driver_as_it_is(start, operator: Operator, tmp_path: pathlib.Path) -> None:
-    demos = start("sctn", "demos", "--problem", "placing", "--episodes", 1, "--seed", 10000, "--out", tmp_path / "demos")
-    assert demos.wait(120.0) == 0, demos.log()
-    (demonstration,) = [file.parent for file in (tmp_path / "demos").rglob("metadata.yaml")]
-    start("sim_workcell", *parameters("sim_workcell", problem="placing", seed=10000))
-    start("camera_fusion", *parameters("camera_fusion"))
-    start("goal_oracle", *parameters("goal_oracle", demonstration=demonstration))
-    start("gctn_policy", *parameters("gctn_policy", checkpoint=REPOSITORY / "config/checkpoints/ten_problems.safetensors"))
-    start("suction_executor", *parameters("suction_executor"))
-    operator.listeners = 3
-    begin = time.monotonic()
-    outcomes: list[int] = []
-    seen = 0
-    for _ in range(MOST_PROPOSALS):
-        goal = operator.newest("goal") if operator.count("goal") > seen else operator.next("goal", seen)
-        seen = operator.count("goal")
-        wanted = (goal.step, goal.attempt)
-        operator.next("pick_place", accept=lambda made, wanted=wanted: (made.step, made.attempt) == wanted)
-        # Another view may have replaced it meanwhile.
-        operator.until(operator.executor_is_ready, "executor that is ready", 60.0)
-        proposal = operator.newest("pick_place")
-        rewards = operator.count("reward")
-        result = operator.approve(proposal)
-        if result.outcome == StepResult.REFUSED and "superseded" in result.reason:
-            seen -= 1
-            continue
-        outcomes.append(result.outcome)
-        assert result.outcome not in (StepResult.FAULT, StepResult.STOPPED, StepResult.REFUSED), result.reason
-        reward = operator.next("reward", rewards)
-        if reward.complete:
-            break
-        operator.confirm(proposal.id, StepConfirmation.ADVANCE if reward.delta > 0 else StepConfirmation.RETRY)
-    took_s = time.monotonic() - begin
-    print(f"placing: {len(outcomes)} motions in {took_s:.0f} s, total reward {operator.newest('reward').total:.3f}")
-    assert operator.newest("reward").complete
-
-
 def test_the_way_home_moves_only_by_an_approval_of_that_very_proposal(cell: Cell) -> None:
     client = cell.operator.node.create_client(ProposeHome, "suction_executor/propose_home")
 
@@ -293,3 +269,12 @@ def test_the_way_home_moves_only_by_an_approval_of_that_very_proposal(cell: Cell
     assert second.proposal_id != first.proposal_id
     assert cell.decide(second.proposal_id).outcome == StepResult.AT_HOME
     assert cell.decide(second.proposal_id).outcome == StepResult.REFUSED
+
+
+@pytest.mark.parametrize("problem", WHOLE_RUNS)
+def test_a_whole_run_completes_with_a_driver_as_it_is(whole_runs: dict[str, subprocess.Popen[str]], problem: str) -> None:
+    output, log = whole_runs[problem].communicate(timeout=600.0)
+    assert output, log
+    result = json.loads(output)
+    print(f"{problem}: {len(result['outcomes'])} motions in {result['took_s']} s, total reward {result['total_reward']:.3f}")
+    assert result["complete"], (result, log)

@@ -8,7 +8,7 @@ use std::path::PathBuf;
 /// What the campaign is asked for.
 #[derive(clap::Args)]
 pub struct Options {
-    /// How many faults; each takes some 8 s
+    /// How many faults; each takes some 11 s
     #[arg(long, default_value_t = 20)]
     faults: u32,
     /// The same seed draws the same faults at the same moments
@@ -20,6 +20,9 @@ pub struct Options {
     /// End after so long; with --log the next call goes on
     #[arg(long)]
     minutes: Option<f64>,
+    /// How many cells run side by side; each takes a fifth of a core
+    #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u32).range(1..=16))]
+    cells: u32,
     /// Run executors with a planted fault each instead: the monitor has to catch all of them
     #[arg(long)]
     planted: bool,
@@ -33,6 +36,7 @@ pub fn run_faults(options: &Options) -> Result<()> {
     let Options {
         faults,
         seed,
+        cells,
         planted,
         json,
         ..
@@ -42,6 +46,7 @@ pub fn run_faults(options: &Options) -> Result<()> {
     let mut python = environment.python()?;
     python.arg("tests/campaign.py");
     python.args(["--faults", &faults.to_string(), "--seed", &seed.to_string()]);
+    python.args(["--cells", &cells.to_string()]);
     if let Some(log) = &options.log {
         python.arg("--log").arg(log);
     }

@@ -40,12 +40,20 @@ impl Evidence {
         done: Option<f64>,
     ) -> Self {
         let within = |(map, at): (&ScoreMap, [f64; 2]), radius_px: f64| {
-            let scores = map.scores.iter().enumerate().filter(|(index, _)| {
-                let center = |index: usize| (index as f64 + 0.5) * stride as f64;
-                let (x, y) = (center(index % map.cols), center(index / map.cols));
-                (x - at[0]).hypot(y - at[1]) <= radius_px
+            let center = |index: usize| (index as f64 + 0.5) * stride as f64;
+            // Rows and columns that may hold such a cell.
+            let around = |at: f64, len: usize| {
+                let [first, end] = [at - radius_px, at + radius_px].map(|px| px / stride as f64);
+                first.max(0.0) as usize..((end + 1.0).max(0.0) as usize).min(len)
+            };
+            let cells = around(at[1], map.rows)
+                .flat_map(|row| around(at[0], map.cols).map(move |col| (row, col)));
+            let near = cells.filter(|(row, col)| {
+                (center(*col) - at[0]).hypot(center(*row) - at[1]) <= radius_px
             });
-            let sum: f64 = scores.map(|(_, score)| f64::from(*score)).sum();
+            let sum: f64 = near
+                .map(|(row, col)| f64::from(map.scores[row * map.cols + col]))
+                .sum();
             sum.clamp(LEAST, 1.0).ln()
         };
         let near = [pick, place].map(|scores| within(scores, NEAR_PX));

@@ -88,16 +88,8 @@ impl Crop {
 
     /// Of a key with its margin.
     fn of(&self, key: &Tensor) -> Tensor {
-        self.scaled(key, 1)
-    }
-
-    /// Of a key with its margin, whose cells are so many times smaller.
-    fn scaled(&self, key: &Tensor, factor: i64) -> Tensor {
-        key.narrow(2, factor * self.row, factor * self.edge).narrow(
-            3,
-            factor * self.col,
-            factor * self.edge,
-        )
+        key.narrow(2, self.row, self.edge)
+            .narrow(3, self.col, self.edge)
     }
 
     /// Cells that windows are compared at, along each edge.
@@ -124,17 +116,50 @@ enum Fineness {
     Heightmap,
 }
 
+/// Cells of the heightmap for one of the grid, along each edge.
+const FINE: i64 = 2;
+
 impl Fineness {
+    /// Cells for one of the grid, along each edge.
     fn factor(self) -> i64 {
         match self {
             Self::Grid => 1,
-            Self::Heightmap => 2,
+            Self::Heightmap => FINE,
         }
+    }
+
+    /// Of an image (N x C x rows x cols, as many of the heightmap as cells of this fineness need).
+    fn of(self, image: &Tensor) -> Tensor {
+        match self {
+            Self::Grid => image.avg_pool2d([FINE; 2], [FINE; 2], [0, 0], false, true, None::<i64>),
+            Self::Heightmap => image.shallow_clone(),
+        }
+    }
+
+    /// A square of an image (1 x 4 x rows x cols of the heightmap), in cells of this fineness from this row and column on, so many along
+    /// each edge: colour and height, then 1. Outside the image all are 0.
+    fn square(self, image: &Tensor, [row, col]: [i64; 2], edge: i64) -> Tensor {
+        let size = image.size();
+        let factor = FINE / self.factor();
+        let within = |first: i64, len: i64| {
+            let [first, end] = [first, first + edge].map(|at| (factor * at).clamp(0, len));
+            (first, end - first)
+        };
+        let ((first_row, rows), (first_col, cols)) = (within(row, size[2]), within(col, size[3]));
+        let inside = image.narrow(2, first_row, rows).narrow(3, first_col, cols);
+        let inside = self.of(&inside);
+        let one = inside.narrow(1, 0, 1).ones_like();
+        let [before_row, before_col] = [first_row / factor - row, first_col / factor - col];
+        let [after_row, after_col] = [
+            edge - before_row - rows / factor,
+            edge - before_col - cols / factor,
+        ];
+        Tensor::cat(&[inside, one], 1)
+            .constant_pad_nd([before_col, after_col, before_row, after_row])
     }
 }
 
-/// Windows of one sample's query (1 x C x rows x cols, or one for each point) at points of the grid, each at all these turns:
-/// (points turns) x C x k x k.
+/// Windows of one sample's query (1 x C x rows x cols) at points of the grid, each at all these turns: (points turns) x C x k x k.
 fn windows(
     grid: &Grid,
     query: &Tensor,
@@ -142,74 +167,9 @@ fn windows(
     turns: &[usize],
     rotations: usize,
 ) -> Tensor {
-    let size = query.size();
-    let query = query.expand([points.len() as i64, size[1], size[2], size[3]], false);
     let turns = vec![turns.to_vec(); points.len()];
     let (margin, sampling) = (grid.query_margin, grid.sampling);
-    rotated_windows(&query, margin, grid, sampling, points, &turns, rotations).flatten(0, 1)
-}
-
-/// The same of a query whose cells are those of the heightmap: windows of twice as many cells along each edge, whose middle is between
-/// cells as the points are.
-fn fine_windows(
-    grid: &Grid,
-    query: &Tensor,
-    points: &[Point2<f64>],
-    turns: &[usize],
-    rotations: usize,
-) -> Tensor {
-    let size = query.size();
-    let query = query.expand([points.len() as i64, size[1], size[2], size[3]], false);
-    let centers: Vec<_> = points
-        .iter()
-        .map(|point| point * 2.0 + Vector2::repeat(0.5))
-        .collect();
-    let turns = vec![turns.to_vec(); points.len()];
-    let (window, middle) = (2 * grid.window, grid.window as f64 - 0.5);
-    sampled_windows(
-        &query,
-        (window, middle),
-        grid.sampling,
-        &centers,
-        &turns,
-        rotations,
-    )
-    .flatten(0, 1)
-}
-
-/// Colour and height of a sample's observation, of v_{k-1} and of v_k, each 1 x 4 x rows x cols; and where something appeared.
-struct Cells {
-    seen: Tensor,
-    shown: Tensor,
-    appeared: Tensor,
-    /// With 12 mm around it, so that it is told from a larger thing.
-    around: Tensor,
-}
-
-impl Cells {
-    fn new(model: &Compared<'_>, sample: i64, fineness: Fineness) -> Self {
-        let cells = match fineness {
-            Fineness::Grid => &model.fit.cells,
-            Fineness::Heightmap => &model.fit.fine_cells,
-        };
-        let cells = cells.each_ref();
-        let [seen, before, shown] = cells.map(|cells| cells.narrow(0, sample, 1));
-        let change = &shown - before;
-        let rise = change.narrow(1, 3, 1);
-        let recolored = sum(&change.narrow(1, 0, 3).abs()).gt(RECOLORED);
-        let appeared = rise
-            .gt(RISEN)
-            .logical_or(&recolored.logical_and(&rise.gt(-RISEN)))
-            .to_kind(seen.kind());
-        let reach = 2 * fineness.factor();
-        let around = appeared.max_pool2d([2 * reach + 1; 2], [1, 1], [reach; 2], [1, 1], false);
-        Self {
-            seen,
-            shown,
-            appeared,
-            around,
-        }
-    }
+    rotated_windows(query, margin, grid, sampling, points, &turns, rotations).flatten(0, 1)
 }
 
 /// Over channels, which stay.
@@ -217,37 +177,50 @@ fn sum(x: &Tensor) -> Tensor {
     x.sum_dim_intlist([1].as_slice(), true, None::<Kind>)
 }
 
-/// Minus half the squared difference between the cells at each point, at each of these turns, and those of v_k at the place: of colours
-/// where something appeared, and of heights there and around it; a mean over the cells where something appeared. Heights are relative
-/// to the point's and the place's own: an object may stand on another one. (points turns) x places x places.
-fn shape_difference(
-    model: &Compared<'_>,
-    sample: i64,
-    crop: &Crop,
-    (points, turns): (&[Point2<f64>], &[usize]),
-    fineness: Fineness,
-) -> Tensor {
-    let (grid, factor) = (model.grid, fineness.factor());
-    let Cells {
-        seen,
-        shown,
-        appeared,
-        around,
-    } = Cells::new(model, sample, fineness);
-    let relative = |image: &Tensor, row: usize, col: usize| {
-        let heights = image.narrow(1, 3, 1);
-        let first = |at: usize| factor * (at.max(1) - 1) as i64;
-        let last = |at: usize, len: usize| factor * (at + 2).min(len) as i64;
-        let there = heights.slice(2, first(row), last(row, grid.rows), 1).slice(
-            3,
-            first(col),
-            last(col, grid.cols),
-            1,
-        );
-        (heights - there.max()).clamp(-DEEPEST, DEEPEST)
+/// The highest height within a cell of the grid of this cell, by cells of this fineness. `image` is that of one sample.
+fn top_height(image: &Tensor, grid: &Grid, row: usize, col: usize, fineness: Fineness) -> Tensor {
+    let around = |at: usize, len: usize| {
+        let (first, end) = (at.max(1) - 1, (at + 2).min(len));
+        (FINE * first as i64, FINE * (end - first) as i64)
     };
-    let color = shown.narrow(1, 0, 3);
-    let height = relative(&shown, crop.place / grid.cols, crop.place % grid.cols);
+    let ((row, rows), (col, cols)) = (around(row, grid.rows), around(col, grid.cols));
+    let heights = image
+        .narrow(1, 3, 1)
+        .narrow(2, row, rows)
+        .narrow(3, col, cols);
+    fineness.of(&heights).max()
+}
+
+/// Colours, heights above `top` and where a square is inside its image; what is outside is 0.
+fn relative(square: &Tensor, top: &Tensor) -> [Tensor; 3] {
+    let inside = square.narrow(1, 4, 1);
+    let height = (square.narrow(1, 3, 1) - top).clamp(-DEEPEST, DEEPEST) * &inside;
+    [square.narrow(1, 0, 3), height, inside]
+}
+
+/// What queries are compared with: 1 x 8 x edge x edge, of which the last channel is where something appeared.
+fn shape_key(model: &Compared<'_>, sample: i64, crop: &Crop, fineness: Fineness) -> Tensor {
+    let (grid, factor) = (model.grid, fineness.factor());
+    let [_, before, shown] = model.cells(sample);
+    // What appeared is looked at with 12 mm around it, so that it is told from a larger thing.
+    let reach = 2 * factor;
+    let first = [crop.row, crop.col].map(|at| factor * (at - grid.margin as i64) - reach);
+    let edge = factor * crop.edge;
+    let square = |image: &Tensor| fineness.square(image, first, edge + 2 * reach);
+    let (before, shown_square) = (square(&before), square(&shown));
+    let change = &shown_square - before;
+    let rise = change.narrow(1, 3, 1);
+    let recolored = sum(&change.narrow(1, 0, 3).abs()).gt(RECOLORED);
+    let appeared = rise
+        .gt(RISEN)
+        .logical_or(&recolored.logical_and(&rise.gt(-RISEN)))
+        .to_kind(shown.kind());
+    let around = appeared.max_pool2d([2 * reach + 1; 2], [1, 1], [0, 0], [1, 1], false);
+    let inner = |x: &Tensor| x.narrow(2, reach, edge).narrow(3, reach, edge);
+    let (row, col) = (crop.place / grid.cols, crop.place % grid.cols);
+    let top = top_height(&shown, grid, row, col, fineness);
+    let [color, height, inside] = relative(&inner(&shown_square), &top);
+    let (appeared, around) = (inner(&appeared), around * inside);
     let squares = &appeared * sum(&color.square()) + &around * height.square();
     let key = [
         &appeared * color,
@@ -257,31 +230,65 @@ fn shape_difference(
         squares * -0.5,
         appeared,
     ];
+    Tensor::cat(&key, 1)
+}
+
+/// What stands at each point, at each of these turns: (points turns) x 7 x k x k.
+fn shape_windows(
+    model: &Compared<'_>,
+    sample: i64,
+    (points, turns): (&[Point2<f64>], &[usize]),
+    fineness: Fineness,
+) -> Tensor {
+    let (grid, factor) = (model.grid, fineness.factor());
+    let [seen, ..] = model.cells(sample);
     // The middle of a cell of the grid is between cells of the heightmap.
-    let before = factor * grid.margin as i64;
-    let after = before + factor - 1;
-    let key = Tensor::cat(&key, 1).constant_pad_nd([before, after, before, after]);
-    let key = crop.scaled(&key, factor);
-    let color = seen.narrow(1, 0, 3);
-    let queries: Vec<Tensor> = points
-        .iter()
-        .map(|point| {
-            let nearest = |at: f64, len: usize| at.round().clamp(0.0, (len - 1) as f64) as usize;
-            let height = relative(
-                &seen,
-                nearest(point.y, grid.rows),
-                nearest(point.x, grid.cols),
-            );
-            let (square, one) = (height.square(), height.ones_like());
-            Tensor::cat(&[&color, &sum(&color.square()), &height, &square, &one], 1)
-        })
-        .collect();
-    let query = Tensor::cat(&queries, 0);
-    let windows = match fineness {
-        Fineness::Grid => windows(grid, &query, points, turns, model.rotations),
-        Fineness::Heightmap => fine_windows(grid, &query, points, turns, model.rotations),
-    };
-    let edge = factor * grid.window as i64;
+    let (scale, shift) = (factor as f64, 0.5 * (factor - 1) as f64);
+    let window = factor as usize * grid.window;
+    let middle = scale * grid.margin as f64 + shift;
+    // As far as the corner of a turned window reaches, and the next cell.
+    let reach = (middle * std::f64::consts::SQRT_2).ceil() as i64 + 1;
+    let squares = points.iter().map(|point| {
+        let center = point * scale + Vector2::repeat(shift);
+        let first = center.map(|at| at.floor() as i64 - reach);
+        let square = fineness.square(&seen, [first.y, first.x], 2 * (reach + 1));
+        let nearest = |at: f64, len: usize| at.round().clamp(0.0, (len - 1) as f64) as usize;
+        let (row, col) = (nearest(point.y, grid.rows), nearest(point.x, grid.cols));
+        let top = top_height(&seen, grid, row, col, fineness);
+        (square, top, center - first.map(|at| at as f64).coords)
+    });
+    let (mut seen, mut tops, mut centers) = (Vec::new(), Vec::new(), Vec::new());
+    for (square, top, center) in squares {
+        seen.push(square);
+        tops.push(top);
+        centers.push(center);
+    }
+    let top = Tensor::stack(&tops, 0).view([-1, 1, 1, 1]);
+    let [color, height, one] = relative(&Tensor::cat(&seen, 0), &top);
+    let color_squares = sum(&color.square());
+    let query = Tensor::cat(
+        &[&color, &color_squares, &height, &height.square(), &one],
+        1,
+    );
+    let turns = vec![turns.to_vec(); points.len()];
+    let (size, rotations) = ((window, middle), model.rotations);
+    sampled_windows(&query, size, grid.sampling, &centers, &turns, rotations).flatten(0, 1)
+}
+
+/// Minus half the squared difference between the cells at each point, at each of these turns, and those of v_k at the place: of colours
+/// where something appeared, and of heights there and around it; a mean over the cells where something appeared. Heights are relative
+/// to the point's and the place's own: an object may stand on another one. (points turns) x places x places.
+fn shape_difference(
+    model: &Compared<'_>,
+    sample: i64,
+    crop: &Crop,
+    at: (&[Point2<f64>], &[usize]),
+    fineness: Fineness,
+) -> Tensor {
+    let factor = fineness.factor();
+    let key = shape_key(model, sample, crop, fineness);
+    let windows = shape_windows(model, sample, at, fineness);
+    let edge = factor * model.grid.window as i64;
     let all = Tensor::ones([1, 1, edge, edge], (key.kind(), key.device()));
     let area = strided(&key.narrow(1, 7, 1), &all, factor).clamp_min(1.0);
     strided(&key.narrow(1, 0, 7), &windows, factor) / area
@@ -345,6 +352,12 @@ impl<'a> Compared<'a> {
             pick_shape_weight,
             fine_shapes,
         })
+    }
+
+    /// Colour and height of a sample's observation, of v_{k-1} and of v_k, each 1 x 4 x rows x cols of the heightmap.
+    fn cells(&self, sample: i64) -> [Tensor; 3] {
+        let cells = self.fit.cells.each_ref();
+        cells.map(|cells| cells.narrow(0, sample, 1))
     }
 
     /// Where cells are on the grid.
@@ -572,9 +585,7 @@ mod tests {
                 fit: Some(Fit {
                     query: Tensor::cat(&[&seen, &(seen.square() * 0.5), &gate], 1),
                     key: key.constant_pad_nd([GRID.margin as i64; 4]),
-                    cells: [&seen, &seen.zeros_like(), &shown_image]
-                        .map(|image| image.expand([1, 4, -1, -1], false)),
-                    fine_cells: [&seen, &seen.zeros_like(), &shown_image].map(doubled),
+                    cells: [&seen, &seen.zeros_like(), &shown_image].map(doubled),
                 }),
                 done: Tensor::zeros([1], (Kind::Float, tch::Device::Cpu)),
             }),
@@ -688,7 +699,7 @@ mod tests {
         let added = |shown: &Tensor| {
             let mut features = features(&[(10, 10, 3)], (45, 22, 3));
             let fit = features.first.as_mut().and_then(|first| first.fit.as_mut());
-            fit.unwrap().fine_cells = [&seen, &seen.zeros_like(), shown].map(Tensor::shallow_clone);
+            fit.unwrap().cells = [&seen, &seen.zeros_like(), shown].map(Tensor::shallow_clone);
             let logits = Tensor::zeros([1, 36, 60, 40], (Kind::Float, tch::Device::Cpu));
             let mut config = config(4, [80.0, 0.0]);
             if let Network::Matching(matching) = &mut config.network {
@@ -749,8 +760,7 @@ mod tests {
         let mut features = features(&[(10, 10, 3)], (45, 22, 3));
         let fit = features.first.as_mut().and_then(|first| first.fit.as_mut());
         let (fit, images) = (fit.unwrap(), [&lying, &lying.zeros_like(), &standing]);
-        fit.cells = images.map(|image| image.expand([1, 4, -1, -1], false));
-        fit.fine_cells = images.map(doubled);
+        fit.cells = images.map(doubled);
         features
     }
 

@@ -31,7 +31,8 @@ pub(crate) fn rotated_windows(
     sampled_windows(features, window, sampling, &centers, turns, rotations)
 }
 
-/// The same of features without a margin: windows of so many cells along each edge, with their middle at this index of theirs.
+/// The same of features without a margin: windows of so many cells along each edge, with their middle at this index of theirs. Of the
+/// features of one sample (1 x C x rows x cols) windows at any number of centres.
 pub(crate) fn sampled_windows(
     features: &Tensor,
     (window, middle): (usize, f64),
@@ -45,29 +46,46 @@ pub(crate) fn sampled_windows(
     let turn_count = turns[0].len();
     // Feature index -> [-1, 1] with -1 and 1 at the centres of the outermost cells.
     let normal = Vector2::new(2.0 / (cols - 1) as f64, 2.0 / (rows - 1) as f64);
-    let mut points: Vec<f64> = Vec::with_capacity(2 * centers.len() * turn_count * window * window);
-    for (center, turns) in centers.iter().zip(turns) {
-        let center = center.coords;
-        for turn in turns {
+    // From the centre to each cell of each window.
+    let offsets = |turns: &[usize]| -> Vec<Vector2<f64>> {
+        let cell = |index: usize| Vector2::new((index % window) as f64, (index / window) as f64);
+        let turned = |turn: &usize| {
             let inverse = Rotation2::new(-rotation_angle(*turn, rotations));
-            for row in 0..window {
-                for col in 0..window {
-                    let offset = Vector2::new(col as f64, row as f64).add_scalar(-middle);
-                    let point = center + inverse * offset;
-                    let point = match sampling {
-                        Interpolation::Bilinear => point,
-                        Interpolation::Nearest => point.map(nearest),
-                    };
-                    points.extend((point.component_mul(&normal)).add_scalar(-1.0).iter());
-                }
-            }
+            (0..window * window).map(move |index| inverse * cell(index).add_scalar(-middle))
+        };
+        turns.iter().flat_map(turned).collect()
+    };
+    let are_turned_alike = turns.iter().all(|other| *other == turns[0]);
+    let shared = are_turned_alike.then(|| offsets(&turns[0]));
+    // Where all windows of all samples lie alike, they are computed once.
+    let are_alike = are_turned_alike && centers.iter().all(|other| *other == centers[0]);
+    let chosen = match are_alike {
+        true => &centers[..1],
+        false => centers,
+    };
+    let mut points: Vec<f64> = Vec::with_capacity(2 * chosen.len() * turn_count * window * window);
+    for (center, turns) in chosen.iter().zip(turns) {
+        let own = match &shared {
+            Some(_) => Vec::new(),
+            None => offsets(turns),
+        };
+        for offset in shared.as_ref().unwrap_or(&own) {
+            let point = center.coords + offset;
+            let point = match sampling {
+                Interpolation::Bilinear => point,
+                Interpolation::Nearest => point.map(nearest),
+            };
+            points.extend((point.component_mul(&normal)).add_scalar(-1.0).iter());
         }
     }
     let (turn_count, window) = (turn_count as i64, window as i64);
+    let count = centers.len() as i64;
     let points = Tensor::from_slice(&points)
-        .view([samples, turn_count * window, window, 2])
+        .view([chosen.len() as i64, turn_count * window, window, 2])
         .to_kind(features.kind())
-        .to_device(features.device());
+        .to_device(features.device())
+        .expand([count, -1, -1, -1], false)
+        .reshape([samples, -1, window, 2]);
     let mode = match sampling {
         Interpolation::Bilinear => 0,
         Interpolation::Nearest => 1,
@@ -76,8 +94,9 @@ pub(crate) fn sampled_windows(
     features
         .contiguous()
         .grid_sampler_2d(&points, mode, ZEROS, true)
-        .view([samples, channels, turn_count, window, window])
+        .view([samples, channels, -1, window, window])
         .transpose(1, 2)
+        .reshape([count, turn_count, channels, window, window])
 }
 
 /// The nearest whole number, the even one of two that are equally near. Turns of 60 and 90 degrees meet
@@ -133,18 +152,16 @@ fn correlate_in_column_frequencies(key: &Tensor, windows: &Tensor, grid: &Grid) 
         .unfold(3, rows, 1)
         .narrow(3, 0, window)
         .reshape([samples * frequencies, 2, channels * window, rows]);
-    let [key_real, key_imaginary] = [0, 1].map(|part| keys.select(1, part));
-    // The same of the windows, samples * frequencies x turns x channels * window.
+    // What the windows' conjugates take from the real and from the imaginary part of the key, to the real and to the imaginary part of
+    // the product: samples * frequencies x 2 * turns x channels * window each. So a key is read once for both.
     let windows = spectrum
-        .of(&windows.reshape([samples, turns * channels * window, window]))
-        .view([samples * frequencies, 2, turns, channels * window]);
-    let [real, imaginary] = [0, 1].map(|part| windows.select(1, part));
-
-    let product = [
-        real.bmm(&key_real) + imaginary.bmm(&key_imaginary),
-        real.bmm(&key_imaginary) - imaginary.bmm(&key_real),
-    ];
-    let product = Tensor::stack(&product, 1).view([samples, 2 * frequencies, turns * rows]);
+        .of_conjugates(&windows.reshape([samples, turns * channels * window, window]))
+        .view([samples * frequencies, 2, 2 * turns, channels * window]);
+    let [from_real, from_imaginary] = [0, 1].map(|part| windows.select(1, part));
+    let product = from_real
+        .bmm(&keys.select(1, 0))
+        .baddbmm(&from_imaginary, &keys.select(1, 1), 1, 1)
+        .view([samples, 2 * frequencies, turns * rows]);
     spectrum
         .back(&product, cols)
         .view([samples, turns, rows, cols])
@@ -167,39 +184,57 @@ impl Spectrum {
         }
     }
 
-    /// A matrix, 2 * frequencies (cosine and sine of each) x numbers, of the first numbers; each row times its factor.
-    fn matrix(&self, numbers: i64, factor: impl Fn(i64) -> [f64; 2]) -> Tensor {
-        let mut matrix = Vec::with_capacity((2 * self.frequencies * numbers) as usize);
+    /// A matrix of so many rows for each frequency x numbers, of the first numbers. Each row is a factor times the frequency's cosine
+    /// and another times its sine.
+    fn matrix<const ROWS: usize>(
+        &self,
+        numbers: i64,
+        factors: impl Fn(i64) -> [[f64; 2]; ROWS],
+    ) -> Tensor {
+        // One turn of the circle: every angle is one of these.
+        let circle: Vec<(f64, f64)> = (0..self.len)
+            .map(|at| (std::f64::consts::TAU * at as f64 / self.len as f64).sin_cos())
+            .collect();
+        let rows = ROWS as i64 * self.frequencies;
+        let mut matrix = Vec::with_capacity((rows * numbers) as usize);
         for frequency in 0..self.frequencies {
-            let angle = |at: i64| {
-                let turn = (frequency * at % self.len) as f64 / self.len as f64;
-                std::f64::consts::TAU * turn
-            };
-            let [cosine, sine] = factor(frequency);
-            matrix.extend((0..numbers).map(|at| cosine * angle(at).cos()));
-            matrix.extend((0..numbers).map(|at| sine * angle(at).sin()));
+            for [of_cosine, of_sine] in factors(frequency) {
+                matrix.extend((0..numbers).map(|at| {
+                    let (sine, cosine) = circle[(frequency * at % self.len) as usize];
+                    of_cosine * cosine + of_sine * sine
+                }));
+            }
         }
         Tensor::from_slice(&matrix)
-            .view([2 * self.frequencies, numbers])
+            .view([rows, numbers])
             .to_kind(self.options.0)
             .to_device(self.options.1)
     }
 
     /// Real and imaginary parts of the spectra of N x rows x numbers, padded with 0: N x 2 * frequencies x rows.
     fn of(&self, numbers: &Tensor) -> Tensor {
-        let matrix = self.matrix(numbers.size()[2], |_| [1.0, -1.0]);
+        let matrix = self.matrix(numbers.size()[2], |_| [[1.0, 0.0], [0.0, -1.0]]);
+        matrix.matmul(&numbers.transpose(1, 2))
+    }
+
+    /// Of the same spectra, real a and imaginary b: at each frequency a, -b, b, a, as a product with their conjugates
+    /// takes them. N x 4 * frequencies x rows.
+    fn of_conjugates(&self, numbers: &Tensor) -> Tensor {
+        let real = [1.0, 0.0];
+        let rows = |_| [real, [0.0, 1.0], [0.0, -1.0], real];
+        let matrix = self.matrix(numbers.size()[2], rows);
         matrix.matmul(&numbers.transpose(1, 2))
     }
 
     /// The first numbers of spectra N x 2 * frequencies x rows: N x rows x numbers.
     fn back(&self, spectra: &Tensor, numbers: i64) -> Tensor {
-        let factor = |frequency: i64| {
+        let factors = |frequency: i64| {
             // Every frequency but the lowest and, of an even length, the highest stands for its mirror image too.
             let alone = frequency == 0 || 2 * frequency == self.len;
             let share = if alone { 1.0 } else { 2.0 } / self.len as f64;
-            [share, -share]
+            [[share, 0.0], [0.0, -share]]
         };
-        let matrix = self.matrix(numbers, factor);
+        let matrix = self.matrix(numbers, factors);
         spectra.transpose(1, 2).matmul(&matrix)
     }
 }

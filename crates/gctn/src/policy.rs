@@ -216,38 +216,31 @@ impl Policy {
                 count: exclude.len(),
             });
         }
-        let sum: f64 = logits
+        let shares: Vec<f64> = logits
             .iter()
             .map(|logit| f64::from(logit - top).exp())
-            .sum();
-        let scores = logits
-            .iter()
-            .map(|logit| (f64::from(logit - top).exp() / sum) as f32)
             .collect();
+        let sum: f64 = shares.iter().sum();
+        let scores = shares.iter().map(|share| (share / sum) as f32).collect();
         Ok((center_px(best), sum.recip(), self.map(scores)))
     }
 
     fn place(&self, logits: &Tensor) -> Result<(Point2<f64>, usize, f64, ScoreMap), Error> {
         let grid = &self.model.grid;
-        // What lies further below the top adds nothing to the sum, and underflows, which would cost most of its time.
-        const DEEPEST: f64 = 40.0;
-        let flat = logits.flatten(0, -1);
-        let (top, best) = flat.max_dim(0, false);
-        let (top, best) = (top.double_value(&[]), best.int64_value(&[]) as usize);
-        // Not finite where any of them is not, so that only the maps decided on need to be looked at.
-        let sum = flat.sum(Kind::Float).double_value(&[]);
-        if !(top + sum).is_finite() {
-            let what = "the place map";
-            return Err(Error::NotFinite { what, step: None });
-        }
-        let near = flat.masked_select(&flat.gt(top - DEEPEST));
-        let log_sum = near.logsumexp([0].as_slice(), false).double_value(&[]);
+        // What lies further below the top adds nothing to the sum.
+        const DEEPEST: f32 = 40.0;
+        let logits = values(logits, "the place map")?;
+        let best = argmax(&logits);
+        let top = logits[best];
+        let near = logits.iter().filter(|logit| top - **logit < DEEPEST);
+        let sum: f64 = near.map(|logit| f64::from(logit - top).exp()).sum();
+        let log_sum = f64::from(top) + sum.ln();
         let cells = grid.rows * grid.cols;
         let (rotation, cell) = (best / cells, best % cells);
-        let map = values(&logits.get(rotation as i64), "the place map")?;
+        let map = &logits[rotation * cells..][..cells];
         let (row, col) = (cell / grid.cols, cell % grid.cols);
         let offset = if grid.subcell {
-            subcell(&map, grid.rows, grid.cols, row, col)
+            subcell(map, grid.rows, grid.cols, row, col)
         } else {
             [0.0; 2]
         };
@@ -275,7 +268,10 @@ pub(crate) fn values(tensor: &Tensor, what: &'static str) -> Result<Vec<f32>, Er
         .contiguous();
     let mut values = vec![0.0; tensor.numel()];
     tensor.f_copy_data(&mut values, tensor.numel())?;
-    if values.iter().all(|value: &f32| value.is_finite()) {
+    // In parts, each without a branch for every number.
+    const PART: usize = 256;
+    let finite = |part: &[f32]| part.iter().fold(true, |all, one| all & one.is_finite());
+    if values.chunks(PART).all(finite) {
         Ok(values)
     } else {
         Err(Error::NotFinite { what, step: None })
@@ -284,7 +280,21 @@ pub(crate) fn values(tensor: &Tensor, what: &'static str) -> Result<Vec<f32>, Er
 
 /// Index of the first of the largest.
 fn argmax(values: &[f32]) -> usize {
-    let top = values.iter().copied().fold(f32::NEG_INFINITY, f32::max);
+    // Sixteen at a time: the largest number does not depend on the order.
+    const LANES: usize = 16;
+    let larger = |one: f32, other: f32| if other > one { other } else { one };
+    let (parts, rest) = values.as_chunks::<LANES>();
+    let mut tops = [f32::NEG_INFINITY; LANES];
+    for part in parts {
+        for (top, value) in tops.iter_mut().zip(part) {
+            *top = larger(*top, *value);
+        }
+    }
+    let top = tops
+        .iter()
+        .chain(rest)
+        .copied()
+        .fold(f32::NEG_INFINITY, larger);
     values.iter().position(|value| *value == top).unwrap_or(0)
 }
 

@@ -143,14 +143,10 @@ impl MatchingNet {
             let query = [seen.shallow_clone(), half_square(&seen), gate.ones_like()];
             let key = [&shown * &gate, -&gate, -&gate * half_square(&shown)];
             let images = [sequence::OBSERVATION, sequence::PREVIOUS, sequence::IMAGE];
-            let fine_cells = images.map(|from| image(from).to_kind(self.scale.kind()));
             Fit {
                 query: Tensor::cat(&query, 1),
                 key: Tensor::cat(&key, 1).constant_pad_nd(margin),
-                cells: fine_cells.each_ref().map(|cells| {
-                    cells.avg_pool2d([2, 2], [2, 2], [0, 0], false, true, None::<i64>)
-                }),
-                fine_cells,
+                cells: images.map(|from| image(from).to_kind(self.scale.kind())),
             }
         });
         Features {

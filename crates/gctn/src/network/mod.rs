@@ -52,10 +52,9 @@ pub(crate) struct Fit {
     pub query: Tensor,
     /// Of v_k, N x C x rows x cols, with `margin` cells around.
     pub key: Tensor,
-    /// Colour and height (4 channels) of the observation, of v_{k-1} and of v_k, each N x 4 x rows x cols: not learned.
+    /// Colour and height (4 channels) of the observation, of v_{k-1} and of v_k, by the cells of the heightmap, two for each of the grid
+    /// along rows and columns: not learned.
     pub cells: [Tensor; 3],
-    /// The same by the cells of the heightmap, two for each of these along rows and columns.
-    pub fine_cells: [Tensor; 3],
 }
 
 impl Features {
@@ -75,7 +74,6 @@ impl Features {
                     query: of(&fit.query),
                     key: of(&fit.key),
                     cells: fit.cells.each_ref().map(of),
-                    fine_cells: fit.fine_cells.each_ref().map(of),
                 }),
             }),
         }

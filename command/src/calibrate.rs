@@ -641,7 +641,7 @@ mod tests {
             .run(&root)
             .unwrap();
         assert_eq!(image::open(&png).unwrap().width() / 640, 3);
-        let read = camera_fusion::read_calibration(&out).unwrap();
+        let read = calibration::read_calibration(&out).unwrap();
         for camera in &cameras {
             let off = camera.world_from_camera.inv_mul(&read[&camera.name]);
             assert!(

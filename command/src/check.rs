@@ -4,10 +4,9 @@ use crate::bag::record_topics;
 use crate::root::Root;
 use anyhow::{Context, Result, ensure};
 use bags::BagReader;
-use calibration::{CheckLimits, Frame, Limit, Measure, check_cameras};
-use camera_fusion::{Transforms, read_calibration};
+use calibration::{CheckLimits, Frame, Limit, Measure, check_cameras, read_calibration};
 use clap::Args;
-use heightmap::{Camera, StillSettings, Workspace, has_shape_of, scale_depth};
+use heightmap::{Camera, StillSettings, Transforms, Workspace, has_shape_of, scale_depth};
 use msgs::{convert, sensor_msgs, tf2_msgs};
 use nalgebra::{Isometry2, Point2};
 use serde::Serialize;
@@ -156,8 +155,11 @@ impl Check {
                 continue;
             }
             if name == "/tf_static" {
-                let errors = transforms.update(message.decode::<tf2_msgs::TFMessage>()?);
-                ensure!(errors.is_empty(), "{shown}: /tf_static: {}", errors[0]);
+                let message = message.decode::<tf2_msgs::TFMessage>()?;
+                let insert =
+                    |parent: &str, child: &str, pose| transforms.insert(parent, child, pose);
+                let invalid = convert::transforms_from_msg(&message, insert);
+                ensure!(invalid.is_empty(), "{shown}: /tf_static: {}", invalid[0]);
                 continue;
             }
             let index = self

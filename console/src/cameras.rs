@@ -5,14 +5,12 @@ use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
-use heightmap::{Distortion, Intrinsics};
+use heightmap::{Distortion, Intrinsics, TransformError, Transforms};
 use nalgebra::Isometry3;
 use serde::Serialize;
 
 /// Images go on for so long after somebody has looked.
 const LINGER: Duration = Duration::from_secs(5);
-/// Most transforms that are kept, and most that lead from a camera to the world.
-const MOST_TRANSFORMS: usize = 1000;
 
 /// An image, and what is needed to draw on it.
 #[derive(Clone, Debug, Default)]
@@ -36,8 +34,7 @@ pub struct Cameras {
 struct State {
     wanted_until: Option<Instant>,
     seen: BTreeMap<String, Seen>,
-    /// By child frame: parent frame, and pose of the child in it.
-    transforms: BTreeMap<String, (String, Isometry3<f64>)>,
+    transforms: Transforms,
 }
 
 /// A camera, as the API has it.
@@ -67,7 +64,7 @@ impl Cameras {
             state: Mutex::new(State {
                 wanted_until: None,
                 seen: names.map(|name| (name.clone(), Seen::default())).collect(),
-                transforms: BTreeMap::new(),
+                transforms: Transforms::default(),
             }),
         }
     }
@@ -96,7 +93,8 @@ impl Cameras {
                 cy_px,
                 distortion: Distortion { k1, k2, p1, p2, k3 },
             } = seen.intrinsics?;
-            let pose = state.pose(&seen.frame, &self.world_frame).map(|pose| {
+            let pose = state.transforms.world_from(&seen.frame, &self.world_frame);
+            let pose = pose.ok().map(|pose| {
                 let matrix = pose.to_homogeneous();
                 std::array::from_fn(|row| std::array::from_fn(|col| matrix[(row, col)]))
             });
@@ -151,28 +149,16 @@ impl Cameras {
     }
 
     /// The pose of a frame in its parent frame has come.
-    pub fn on_transform(&self, parent: String, child: String, pose: Isometry3<f64>) {
-        let transforms = &mut self.lock().transforms;
-        if transforms.len() < MOST_TRANSFORMS {
-            transforms.insert(child, (parent, pose));
-        }
-    }
-}
-
-impl State {
-    /// Pose of a frame in the world.
-    fn pose(&self, frame: &str, world_frame: &str) -> Option<Isometry3<f64>> {
-        let mut pose = Isometry3::identity();
-        let mut frame = frame;
-        for _ in 0..MOST_TRANSFORMS {
-            if frame == world_frame {
-                return Some(pose);
-            }
-            let (parent, of_child) = self.transforms.get(frame)?;
-            pose = of_child * pose;
-            frame = parent;
-        }
-        None
+    ///
+    /// # Errors
+    /// When the frame has no name, or there are too many.
+    pub fn on_transform(
+        &self,
+        parent: &str,
+        child: &str,
+        pose: Isometry3<f64>,
+    ) -> Result<(), TransformError> {
+        self.lock().transforms.insert(parent, child, pose)
     }
 }
 
@@ -209,8 +195,12 @@ mod tests {
 
         assert!(cameras.look()[0].pose.is_none());
         let along_x = |x_m| Isometry3::translation(x_m, 0.0, 0.0);
-        cameras.on_transform("world".into(), "link".into(), along_x(1.0));
-        cameras.on_transform("link".into(), "optical".into(), along_x(2.0));
+        let link = |parent, child, x_m| {
+            let linked = cameras.on_transform(parent, child, along_x(x_m));
+            linked.unwrap();
+        };
+        link("world", "link", 1.0);
+        link("link", "optical", 2.0);
         let pose = cameras.look()[0].pose.unwrap();
         assert_eq!(
             pose,
@@ -221,7 +211,7 @@ mod tests {
             ]
         );
         // A circle of frames leads nowhere.
-        cameras.on_transform("optical".into(), "link".into(), along_x(1.0));
+        link("optical", "link", 1.0);
         assert!(cameras.look()[0].pose.is_none());
     }
 }

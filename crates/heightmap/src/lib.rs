@@ -11,6 +11,7 @@ mod fusion;
 pub mod picture;
 mod registration;
 mod still;
+mod transforms;
 mod workspace;
 
 pub use camera::{Camera, CameraError, Intrinsics};
@@ -19,6 +20,7 @@ pub use distortion::Distortion;
 pub use fusion::{Fusion, FusionError, FusionReport, View};
 pub use registration::{has_shape_of, register_depth, scale_depth};
 pub use still::{StillFusion, StillSettings};
+pub use transforms::{TransformError, Transforms, Unconnected};
 pub use workspace::{Disk, Heightmap, HeightmapError, Pixel, Workspace, WorkspaceError};
 
 /// The examples of the README are run as tests.

@@ -10,6 +10,7 @@ mod motion;
 mod preview;
 mod step;
 mod time;
+mod transforms;
 
 pub use camera::{
     color_from_msg, color_to_msg, depth_from_msg, depth_to_msg, depth_to_msg_mm,
@@ -30,3 +31,4 @@ pub use step::{
     proposal_to_msg, result_from_msg, result_to_msg, reward_from_msg,
 };
 pub use time::{duration_from_msg, duration_to_msg, time_from_msg, time_to_msg};
+pub use transforms::{InvalidTransform, transforms_from_msg};

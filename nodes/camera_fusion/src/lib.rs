@@ -1,9 +1,8 @@
 //! Node that fuses camera views into heightmaps.
 //!
-//! What belongs together and what is wrong with it is decided in [`FrameSynchronizer`], which knows no ROS node.
+//! What belongs together and what is wrong with it is decided by the library `frame_synchronizer`.
 
-mod extrinsics;
-mod frame_synchronizer;
+mod image;
 mod outputs;
 mod parameters;
 
@@ -14,8 +13,10 @@ use std::{
     time::{Duration, Instant},
 };
 
+use calibration::read_calibration;
+use frame_synchronizer::{FrameSynchronizer, Fused, InputError, Stream, Used};
 use msgs::{
-    sctn_msgs,
+    convert, sctn_msgs,
     sensor_msgs::{CameraInfo, Image},
     tf2_msgs::TFMessage,
 };
@@ -26,10 +27,9 @@ use node_kit::{
 use tokio::sync::mpsc;
 use tracing::{info, warn};
 
+use image::ImageMessage;
 use outputs::Outputs;
 
-pub use extrinsics::{CalibrationError, TransformError, Transforms, Unconnected, read_calibration};
-pub use frame_synchronizer::{FrameSynchronizer, Fused, InputError, Stream, Used};
 pub use parameters::{CameraFusionParameters, WorkspaceParameters};
 
 /// Messages between their subscriptions and the fusion.
@@ -66,7 +66,7 @@ impl Active for FusionNode {
     async fn run(&mut self, node: &Node) -> anyhow::Result<()> {
         let mut changes = node.parameters::<CameraFusionParameters>();
         self.take_over(changes.borrow_and_update().clone());
-        self.synchronizer = FrameSynchronizer::new(&self.parameters, self.poses.clone());
+        self.synchronizer = FrameSynchronizer::new(self.parameters.settings(), self.poses.clone());
         self.cameras.clear();
         self.active_since = Instant::now();
         let mut transforms = node.subscription::<TFMessage>("/tf_static", Qos::Latched)?;
@@ -83,8 +83,9 @@ impl Active for FusionNode {
                     None => return Ok(()),
                 },
                 message = transforms.recv() => {
-                    for reason in self.synchronizer.transform(message) {
-                        transforms.reject(reason);
+                    let insert = |parent: &str, child: &str, pose| self.synchronizer.transform(parent, child, pose);
+                    for invalid in convert::transforms_from_msg(&message, insert) {
+                        transforms.reject(invalid);
                     }
                     self.fuse();
                 }
@@ -99,7 +100,7 @@ impl Active for FusionNode {
 pub struct FusionNode {
     parameters: CameraFusionParameters,
     poses: BTreeMap<String, nalgebra::Isometry3<f64>>,
-    synchronizer: FrameSynchronizer,
+    synchronizer: FrameSynchronizer<ImageMessage>,
     cameras: Vec<CameraTopics>,
     timeout: Duration,
     active_since: Instant,
@@ -177,7 +178,7 @@ impl FusionNode {
         poses: BTreeMap<String, nalgebra::Isometry3<f64>>,
     ) -> Result<Self, NodeError> {
         Ok(Self {
-            synchronizer: FrameSynchronizer::new(&parameters, poses.clone()),
+            synchronizer: FrameSynchronizer::new(parameters.settings(), poses.clone()),
             cameras: Vec::new(),
             timeout: Duration::from_secs_f64(parameters.camera_timeout_s),
             active_since: Instant::now(),
@@ -196,7 +197,7 @@ impl FusionNode {
     /// Those that may be set at run time.
     fn take_over(&mut self, parameters: CameraFusionParameters) {
         self.timeout = Duration::from_secs_f64(parameters.camera_timeout_s);
-        self.synchronizer.set_tolerance_s(parameters.tolerance_s);
+        self.synchronizer.set_tolerance(parameters.tolerance());
         self.parameters = parameters;
     }
 
@@ -262,7 +263,8 @@ impl FusionNode {
     fn arrived(&mut self, arrival: Arrival) {
         let taken = match arrival {
             Arrival::Info(camera, stream, info) => {
-                let taken = self.synchronizer.calibrate(camera, stream, &info);
+                let read = convert::intrinsics_from_msg(&info).map_err(|error| error.to_string());
+                let taken = self.synchronizer.calibrate(camera, stream, read);
                 taken.map(|()| false)
             }
             Arrival::Image(camera, stream, image) => {
@@ -288,7 +290,12 @@ impl FusionNode {
                         self.parameters.clock_skew_limit_s
                     );
                 }
-                self.synchronizer.image(camera, stream, image)
+                convert::time_from_msg(&image.header.stamp)
+                    .map(|stamp| {
+                        let image = ImageMessage(image);
+                        self.synchronizer.image(camera, stream, stamp, image)
+                    })
+                    .map_err(|error| InputError::new(camera, stream, format!("header.{error}")))
             }
         };
         match taken {
@@ -331,10 +338,19 @@ impl FusionNode {
     fn publish(&mut self, fused: Fused, start: Instant) {
         let Fused {
             heightmap,
-            message,
+            report,
             stamp,
             used,
         } = fused;
+        let header = convert::header(stamp, &self.parameters.world_frame);
+        let message = header.and_then(|header| {
+            let heightmap = heightmap.clone();
+            convert::heightmap_to_msg(heightmap, header, report.views, report.coverage)
+        });
+        let message = match message {
+            Ok(message) => message,
+            Err(error) => return self.heightmap.statistics().reject(error),
+        };
         let header = message.header.clone();
         self.last = Some((stamp, message.views, message.coverage));
         self.used = used;

@@ -1,8 +1,10 @@
 //! Parameters of the node.
 
 use std::path::PathBuf;
+use std::time::Duration;
 
-use heightmap::Workspace;
+use frame_synchronizer::Settings;
+use heightmap::{StillSettings, Workspace};
 use nalgebra::Point2;
 use node_kit::{InvalidParameter, Parameters, Range};
 use serde::{Deserialize, Serialize};
@@ -84,6 +86,28 @@ impl WorkspaceParameters {
             pixel_size_m: self.pixel_size_m,
             z_min_m: self.z_min_m,
             z_max_m: self.z_max_m,
+        }
+    }
+}
+
+impl CameraFusionParameters {
+    pub(crate) fn tolerance(&self) -> Duration {
+        Duration::from_secs_f64(self.tolerance_s)
+    }
+
+    /// As the synchronizer takes them.
+    pub(crate) fn settings(&self) -> Settings {
+        Settings {
+            cameras: self.cameras.clone(),
+            world_frame: self.world_frame.clone(),
+            tolerance: self.tolerance(),
+            workspace: self.workspace.workspace(),
+            still: (self.frames > 1).then_some(StillSettings {
+                frames: self.frames,
+                percentile: self.percentile,
+                edge_step_m: self.edge_step_m as f32,
+            }),
+            fuse_without_silent: self.fuse_without_silent,
         }
     }
 }

@@ -18,12 +18,9 @@ pub async fn follow_transforms(node: Node, cameras: Arc<Cameras>) -> anyhow::Res
     let mut transforms = node.subscription::<TFMessage>("/tf_static", Qos::Latched)?;
     loop {
         let message = transforms.recv().await;
-        for transform in message.transforms {
-            let child = transform.child_frame_id;
-            match convert::isometry_from_msg(&transform.transform) {
-                Ok(pose) => cameras.on_transform(transform.header.frame_id, child, pose),
-                Err(error) => transforms.reject(format_args!("{child}: {error}")),
-            }
+        let insert = |parent: &str, child: &str, pose| cameras.on_transform(parent, child, pose);
+        for invalid in convert::transforms_from_msg(&message, insert) {
+            transforms.reject(invalid);
         }
     }
 }

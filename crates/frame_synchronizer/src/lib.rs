@@ -1,30 +1,65 @@
-//! Which images make one heightmap: messages in, a heightmap out, no ROS around it.
+//! Which images of several cameras make one heightmap: images in, a heightmap out. It knows no ROS: an [`Image`] is
+//! whatever a driver sends, and is decoded only when it is fused.
 
 mod camera_state;
 
-use std::{
-    collections::{BTreeMap, VecDeque},
-    time::Duration,
-};
+use std::collections::{BTreeMap, VecDeque};
+use std::fmt::Display;
+use std::time::Duration;
 
 use heightmap::{
-    BlobRule, ChangeRules, Fusion, FusionError, FusionReport, Heightmap, StillFusion,
-    StillSettings, View, largest_change,
-};
-use msgs::{
-    convert, sctn_msgs,
-    sensor_msgs::{CameraInfo, Image},
-    tf2_msgs::TFMessage,
+    BlobRule, ChangeRules, Fusion, FusionError, FusionReport, Heightmap, Intrinsics, StillFusion,
+    StillSettings, TransformError, Transforms, View, Workspace, largest_change,
 };
 use nalgebra::Isometry3;
 
 use self::camera_state::CameraState;
-use crate::{extrinsics::Transforms, parameters::CameraFusionParameters};
 
 /// Images of one stream that wait for their counterparts.
 const WAITING_IMAGES: usize = 4;
 /// A stamp this much older than the last heightmap's means that the clock was set back.
 const CLOCK_SET_BACK: Duration = Duration::from_secs(1);
+
+/// An image as a driver sends it: colour or depth.
+pub trait Image {
+    /// Why it cannot be read: the field, what it is and what was expected.
+    type Error: Display;
+
+    /// Name of its optical frame.
+    fn frame(&self) -> &str;
+
+    /// Width and height.
+    fn size_px(&self) -> (usize, usize);
+
+    /// Reads red, green and blue of each pixel of a colour image.
+    ///
+    /// # Errors
+    /// When it is no colour image of this calibration.
+    fn read_color(&self, intrinsics: &Intrinsics, rgb: &mut Vec<u8>) -> Result<(), Self::Error>;
+
+    /// Reads the depth of each pixel, in metres; 0 where nothing was measured.
+    ///
+    /// # Errors
+    /// When it is no depth image.
+    fn read_depth(&self, depth_m: &mut Vec<f32>) -> Result<(), Self::Error>;
+}
+
+/// What is fused, and how.
+#[derive(Clone, Debug, PartialEq)]
+pub struct Settings {
+    /// Names of the cameras.
+    pub cameras: Vec<String>,
+    /// Frame of the heightmap.
+    pub world_frame: String,
+    /// How far from the reference stamp images may be.
+    pub tolerance: Duration,
+    /// Volume and grid of the heightmap.
+    pub workspace: Workspace,
+    /// The median over several sets of images, where it is asked for.
+    pub still: Option<StillSettings>,
+    /// Whether heightmaps go on without a silent camera.
+    pub fuse_without_silent: bool,
+}
 
 /// A stream of one camera.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord)]
@@ -54,7 +89,8 @@ pub struct InputError {
 }
 
 impl InputError {
-    fn new(camera: usize, stream: Stream, reason: impl ToString) -> Self {
+    /// What is wrong with what has arrived on a stream.
+    pub fn new(camera: usize, stream: Stream, reason: impl ToString) -> Self {
         Self {
             camera,
             stream,
@@ -78,8 +114,8 @@ impl InputError {
 /// holds; of several images of a stream the nearest is taken. A set is fused once: it must be newer than
 /// the last one. One that cannot be used, such as of a frame without a transform, holds up no older one.
 /// A silent camera is waited for, unless `fuse_without_silent`.
-pub struct FrameSynchronizer {
-    cameras: Vec<CameraState>,
+pub struct FrameSynchronizer<I> {
+    cameras: Vec<CameraState<I>>,
     transforms: Transforms,
     world_frame: String,
     tolerance: Duration,
@@ -103,44 +139,35 @@ pub struct Used {
 /// A heightmap and what it was made from.
 #[derive(Clone, Debug, PartialEq)]
 pub struct Fused {
-    /// For the previews.
+    /// What was seen.
     pub heightmap: Heightmap,
-    /// To be published.
-    pub message: sctn_msgs::Heightmap,
+    /// How much of it was seen.
+    pub report: FusionReport,
     /// Of the newest image.
     pub stamp: Duration,
     /// By camera; nothing where it was left out.
     pub used: Vec<Option<Used>>,
 }
 
-impl FrameSynchronizer {
+impl<I: Image> FrameSynchronizer<I> {
     /// How far from the reference stamp images may be, from the next fusion on.
-    pub fn set_tolerance_s(&mut self, tolerance_s: f64) {
-        self.tolerance = Duration::from_secs_f64(tolerance_s);
+    pub fn set_tolerance(&mut self, tolerance: Duration) {
+        self.tolerance = tolerance;
     }
 
     /// `poses` are those of the calibration file, by camera name.
-    pub fn new(
-        parameters: &CameraFusionParameters,
-        mut poses: BTreeMap<String, Isometry3<f64>>,
-    ) -> Self {
+    pub fn new(settings: Settings, mut poses: BTreeMap<String, Isometry3<f64>>) -> Self {
         let state = |name: &String| CameraState::new(name, poses.remove(name));
         Self {
-            cameras: parameters.cameras.iter().map(state).collect(),
+            cameras: settings.cameras.iter().map(state).collect(),
             transforms: Transforms::default(),
-            world_frame: parameters.world_frame.clone(),
-            tolerance: Duration::from_secs_f64(parameters.tolerance_s),
+            world_frame: settings.world_frame,
+            tolerance: settings.tolerance,
             fusion: Fusion::default(),
-            still: (parameters.frames > 1).then(|| {
-                StillFusion::new(StillSettings {
-                    frames: parameters.frames,
-                    percentile: parameters.percentile,
-                    edge_step_m: parameters.edge_step_m as f32,
-                })
-            }),
-            heightmap: Heightmap::new(parameters.workspace.workspace()),
+            still: settings.still.map(StillFusion::new),
+            heightmap: Heightmap::new(settings.workspace),
             last: None,
-            fuse_without_silent: parameters.fuse_without_silent,
+            fuse_without_silent: settings.fuse_without_silent,
         }
     }
 
@@ -154,20 +181,30 @@ impl FrameSynchronizer {
         self.cameras[camera].silent = silent;
     }
 
-    /// Takes transforms; says which cannot be used.
-    pub fn transform(&mut self, message: TFMessage) -> Vec<String> {
-        let errors = self.transforms.update(message);
-        errors.iter().map(ToString::to_string).collect()
+    /// Takes the pose of a frame in its parent.
+    ///
+    /// # Errors
+    /// When the frame has no name, or there are too many.
+    pub fn transform(
+        &mut self,
+        parent: &str,
+        child: &str,
+        pose: Isometry3<f64>,
+    ) -> Result<(), TransformError> {
+        self.transforms.insert(parent, child, pose)
     }
 
-    /// Takes a calibration of the colour or the depth image; it holds until the next. A bad one takes the last good one away.
+    /// Takes a calibration of the colour or the depth image, or what is wrong with it; it holds until the next. A bad one
+    /// takes the last good one away.
+    ///
+    /// # Errors
+    /// When it is a bad one.
     pub fn calibrate(
         &mut self,
         camera: usize,
         stream: Stream,
-        message: &CameraInfo,
+        read: Result<Intrinsics, String>,
     ) -> Result<(), InputError> {
-        let read = convert::intrinsics_from_msg(message).map_err(|error| error.to_string());
         let state = &mut self.cameras[camera];
         let known = match stream {
             Stream::DepthInfo | Stream::Depth => &mut state.depth_intrinsics,
@@ -182,14 +219,7 @@ impl FrameSynchronizer {
     }
 
     /// Takes an image. `true`: the clock was set back, and everything older is forgotten.
-    pub fn image(
-        &mut self,
-        camera: usize,
-        stream: Stream,
-        image: Image,
-    ) -> Result<bool, InputError> {
-        let stamp = convert::time_from_msg(&image.header.stamp)
-            .map_err(|error| InputError::new(camera, stream, format!("header.{error}")))?;
+    pub fn image(&mut self, camera: usize, stream: Stream, stamp: Duration, image: I) -> bool {
         let set_back = self.last.is_some_and(|last| stamp + CLOCK_SET_BACK < last);
         if set_back {
             self.last = None;
@@ -203,7 +233,7 @@ impl FrameSynchronizer {
         }
         // The same frame again, while nothing moves.
         if self.last.is_some_and(|last| stamp <= last) {
-            return Ok(false);
+            return false;
         }
         let state = &mut self.cameras[camera];
         let waiting = match stream {
@@ -215,7 +245,7 @@ impl FrameSynchronizer {
         if waiting.len() > WAITING_IMAGES {
             waiting.pop_front();
         }
-        Ok(set_back)
+        set_back
     }
 
     /// Fuses the newest new set that can be used, if there is one; and what is wrong with still newer ones.
@@ -285,17 +315,9 @@ impl FrameSynchronizer {
         let Some(report) = report else {
             return Ok(None);
         };
-        let message = convert::header(stamp, &self.world_frame).and_then(|header| {
-            convert::heightmap_to_msg(
-                self.heightmap.clone(),
-                header,
-                report.views,
-                report.coverage,
-            )
-        });
         Ok(Some(Fused {
-            message: message.map_err(|error| general(error.to_string()))?,
             heightmap: self.heightmap.clone(),
+            report,
             stamp,
             used,
         }))
@@ -303,12 +325,12 @@ impl FrameSynchronizer {
 
     /// The newest colour stamp before another about which every camera has an image of both streams.
     fn newest_reference(&self, before: Duration) -> Option<Duration> {
-        let near = |waiting: &VecDeque<(Duration, Image)>, reference: Duration| {
+        let near = |waiting: &VecDeque<(Duration, I)>, reference: Duration| {
             waiting
                 .iter()
                 .any(|(stamp, _)| stamp.abs_diff(reference) <= self.tolerance)
         };
-        let waited_for = |state: &&CameraState| !(self.fuse_without_silent && state.silent);
+        let waited_for = |state: &&CameraState<I>| !(self.fuse_without_silent && state.silent);
         let stamps = self
             .cameras
             .iter()
@@ -317,7 +339,7 @@ impl FrameSynchronizer {
         stamps
             .map(|(stamp, _)| *stamp)
             .filter(|reference| {
-                let complete = |state: &CameraState| {
+                let complete = |state: &CameraState<I>| {
                     near(&state.color, *reference) && near(&state.depth, *reference)
                 };
                 *reference < before && self.cameras.iter().filter(waited_for).all(complete)

@@ -3,19 +3,16 @@
 use std::collections::VecDeque;
 use std::time::Duration;
 
-use heightmap::{Camera, Intrinsics, has_shape_of, register_depth, scale_depth};
-use msgs::convert;
-use msgs::sensor_msgs::Image;
+use heightmap::{Camera, Intrinsics, Transforms, has_shape_of, register_depth, scale_depth};
 use nalgebra::Isometry3;
 
-use super::{InputError, Stream, Used};
-use crate::extrinsics::{Transforms, plain};
+use super::{Image, InputError, Stream, Used};
 
 /// A calibration as it arrived, or what is wrong with it; none before the first.
 type Calibration = Option<Result<Intrinsics, String>>;
 
 /// What has arrived of one camera.
-pub(super) struct CameraState {
+pub(super) struct CameraState<I> {
     name: String,
     /// From the calibration file, which wins over `/tf_static`.
     pub(super) fixed_pose: Option<Isometry3<f64>>,
@@ -23,8 +20,8 @@ pub(super) struct CameraState {
     pub(super) intrinsics: Calibration,
     /// Of the depth image.
     pub(super) depth_intrinsics: Calibration,
-    pub(super) color: VecDeque<(Duration, Image)>,
-    pub(super) depth: VecDeque<(Duration, Image)>,
+    pub(super) color: VecDeque<(Duration, I)>,
+    pub(super) depth: VecDeque<(Duration, I)>,
     pub(super) rgb: Vec<u8>,
     /// For the pixels of the colour image.
     pub(super) depth_m: Vec<f32>,
@@ -34,7 +31,7 @@ pub(super) struct CameraState {
     pub(super) silent: bool,
 }
 
-impl CameraState {
+impl<I: Image> CameraState<I> {
     /// Nothing has arrived yet. `fixed_pose` is that of the calibration file.
     pub(super) fn new(name: &str, fixed_pose: Option<Isometry3<f64>>) -> Self {
         Self {
@@ -61,7 +58,7 @@ impl CameraState {
         world_frame: &str,
     ) -> Result<(Camera, Used), Vec<InputError>> {
         let invalid = |stream, reason: String| InputError::new(index, stream, reason);
-        let nearest = |waiting: &VecDeque<(Duration, Image)>| {
+        let nearest = |waiting: &VecDeque<(Duration, I)>| {
             let stamps = waiting.iter().map(|(stamp, _)| stamp.abs_diff(reference));
             let nearest = stamps.enumerate().min_by_key(|(_, distance)| *distance);
             nearest.map(|(position, _)| position)
@@ -82,7 +79,7 @@ impl CameraState {
                 return Err(vec![InputError::pending(index, Stream::Info, reason)]);
             }
         };
-        let color_frame = self.color[color].1.header.frame_id.clone();
+        let color_frame = self.color[color].1.frame().to_owned();
         let pose = match self.fixed_pose {
             Some(pose) => Ok(pose),
             None => transforms.world_from(&color_frame, world_frame),
@@ -107,9 +104,8 @@ impl CameraState {
             depth: self.depth[depth].0,
         };
         let mut bad = Vec::new();
-        if let Err(error) =
-            convert::color_from_msg(&self.color[color].1, &intrinsics, &mut self.rgb)
-        {
+        let read = self.color[color].1.read_color(&intrinsics, &mut self.rgb);
+        if let Err(error) = read {
             bad.push(invalid(Stream::Color, error.to_string()));
             self.color.remove(color);
         }
@@ -141,12 +137,12 @@ impl CameraState {
     ) -> Result<(), InputError> {
         let refuse = |stream, reason: String| InputError::new(index, stream, reason);
         let image = &self.depth[depth].1;
-        let size_px = (image.width as usize, image.height as usize);
-        let depth_frame = image.header.frame_id.as_str();
+        let size_px = image.size_px();
+        let depth_frame = image.frame();
         let expected = &camera.intrinsics;
-        let read = convert::depth_from_msg(image, &mut self.measured_m);
+        let read = image.read_depth(&mut self.measured_m);
         read.map_err(|error| refuse(Stream::Depth, error.to_string()))?;
-        if plain(depth_frame) == plain(color_frame) {
+        if Transforms::is_same(depth_frame, color_frame) {
             if size_px == (expected.width, expected.height) {
                 std::mem::swap(&mut self.depth_m, &mut self.measured_m);
             } else if has_shape_of(expected, size_px.0, size_px.1) {

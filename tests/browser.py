@@ -57,7 +57,7 @@ class Person:
         self.page: Page = self.context.new_page()
         self.errors: list[str] = []
         self.page.on("pageerror", lambda error: self.errors.append(str(error)))
-        self.page.on("console", lambda said: self.errors.append(said.text) if said.type == "error" else None)
+        self.page.on("console", lambda said: self.errors.append(f"{said.text} ({said.location['url']})") if said.type == "error" else None)
         self.page.goto(address)
         # The dialogue has the focus: a person types and presses Enter.
         expect(self.page.get_by_label("Name", exact=True)).to_be_focused()

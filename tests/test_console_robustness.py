@@ -12,14 +12,13 @@ import random
 import signal
 import time
 import urllib.parse
-from collections.abc import Callable
 
 from cell_operator import EVENT, Operator
 from console_peer import ROUTES, WebSocket, post, spoiled
 from processes import Process
 from sctn_msgs.msg import StepConfirmation, StepResult
 from sctn_msgs.srv import ResetCell
-from test_operator_console import CLIENT, as_arguments, slow_down, until
+from test_operator_console import CLIENT, console_process, slow_down, until
 
 # Moments of a motion at which the console is killed.
 MOMENTS = int(os.environ.get("MOMENTS", "3"))
@@ -37,15 +36,6 @@ VIEWING_S = float(os.environ.get("VIEWING_S", "4"))
 
 # The executor's presence_timeout_s, and what the arm needs to come to rest.
 STOPS_WITHIN_S = 3.0
-
-
-def console_process(start: Callable[..., Process], address_file: pathlib.Path) -> tuple[Process, str]:
-    """A console beside a graph that runs, and its address."""
-    address_file.unlink(missing_ok=True)
-    parameters = {"port": 0, "address_file": address_file, "use_sim_time": "true"}
-    process = start("operator_console", "--ros-args", *as_arguments(parameters))
-    until(address_file.exists, "address of the page", 30.0)
-    return process, address_file.read_text().strip()
 
 
 def approvable(console: CLIENT.Console, since: str | None = None) -> dict:

@@ -108,6 +108,20 @@ def slow_down(operator: Operator, factor: float) -> None:
     assert answer.result().results[0].successful
 
 
+def as_arguments(parameters: dict[str, object]) -> list[str]:
+    """Parameters as `-p name:=value`."""
+    return [word for name, value in parameters.items() for word in ("-p", f"{name}:={value}")]
+
+
+def console_process(start: Callable[..., Process], address_file: pathlib.Path, **more: object) -> tuple[Process, str]:
+    """A console beside a graph that runs, and its address."""
+    address_file.unlink(missing_ok=True)
+    parameters = {"port": 0, "address_file": address_file, "use_sim_time": "true", **more}
+    process = start("operator_console", "--ros-args", *as_arguments(parameters))
+    until(address_file.exists, "address of the page", 30.0)
+    return process, address_file.read_text().strip()
+
+
 def test_a_person_rejects_once_and_then_approves_a_run_of_stacking_to_its_end_by_keyboard(
     browser: Browser, start, operator: Operator, decided, tmp_path: pathlib.Path
 ) -> None:
@@ -305,6 +319,72 @@ def test_a_motion_is_stopped_and_the_run_goes_on_and_a_second_browser_takes_over
     bob.close()
 
 
+def test_what_was_proposed_before_the_table_changed_cannot_be_approved_and_the_page_says_so(
+    browser: Browser, start, operator: Operator, decided, tmp_path: pathlib.Path
+) -> None:
+    launch = start("sctn", "launch", "--problem", "stacking", "--seed", 10018, "--operator", "none", "--processes")
+    # That the policy is stopped is not what the page is to object to.
+    _, address = console_process(start, tmp_path / "address", nodes="[camera_fusion, goal_oracle, suction_executor]")
+    ada = Person(browser, address, "Ada")
+    ada.takes_control()
+    ada.can("Approve")
+    proposal = operator.next("pick_place")
+    policy = program(launch, "gctn_policy")
+    os.kill(policy, signal.SIGSTOP)
+    # The simulator puts the blocks elsewhere.
+    teaching.reset(operator, 10019)
+    ada.cannot("Approve")
+    expect(ada.page.get_by_role("status").filter(has_text="The proposal is stale: the table has changed about (")).to_be_visible()
+    expect(ada.page.get_by_role("status").filter(has_text="Wait for the new proposal.")).to_be_visible()
+    ada.page.keyboard.press("a")
+    # Nor does the console take it from a program of the same operator.
+    session = ada.page.evaluate("sessionStorage.getItem('session')")
+    program_of_ada = CLIENT.Console(address, "a program")
+    program_of_ada._headers["X-Session"] = session
+    with pytest.raises(CLIENT.Refused, match="the table has changed"):
+        program_of_ada.decide("approve", {"id": str(proposal.id)})
+    assert decided() == []
+    # What the policy proposes on the table of now is approved.
+    os.kill(policy, signal.SIGCONT)
+    renewed = operator.next("pick_place", accept=lambda newer: newer.id != proposal.id)
+    ada.can("Approve")
+    ada.button("Approve").click()
+    ada.reads("did it succeed")
+    assert [(one.proposal_id, one.decision) for one in decided()] == [(renewed.id, StepConfirmation.APPROVE)]
+    ada.close()
+
+
+def test_a_page_whose_console_is_gone_says_so_and_decides_again_once_it_is_back(
+    browser: Browser, start, operator: Operator, tmp_path: pathlib.Path
+) -> None:
+    start("sctn", "launch", "--problem", "stacking", "--seed", 10020, "--operator", "none")
+    with socket.create_server(("127.0.0.1", 0)) as probe:
+        port = probe.getsockname()[1]
+    same = {"port": port, "token": "the-same-after-a-restart"}
+    console, address = console_process(start, tmp_path / "address", **same)
+    ada = Person(browser, address, "Ada")
+    ada.takes_control()
+    ada.can("Approve")
+    console.signal(signal.SIGKILL)
+    expect(ada.page.get_by_role("status").filter(has_text="Link lost: connecting again")).to_be_visible()
+    ada.cannot("Approve")
+    expect(ada.page.get_by_role("status").filter(has_text="what you see is old")).to_be_visible()
+    # That nobody answered is all that the browser has to say.
+    console_process(start, tmp_path / "address", **same)
+    expect(ada.page.get_by_role("status").filter(has_text="Connected")).to_be_visible()
+    assert all("ERR_CONNECTION_REFUSED" in error for error in ada.errors), ada.errors
+    ada.errors.clear()
+    # Who decided before the console went does so no longer, until they say so.
+    ada.cannot("Approve")
+    ada.takes_control()
+    ada.can("Approve")
+    results = operator.count("step_result")
+    ada.button("Approve").click()
+    ada.reads("did it succeed")
+    assert operator.next("step_result", results).outcome != StepResult.REFUSED
+    ada.close()
+
+
 def test_a_motion_stops_when_the_deciding_page_is_closed_and_the_run_goes_on_when_somebody_is_back(
     browser: Browser, start, operator: Operator
 ) -> None:
@@ -496,11 +576,6 @@ def test_the_page_is_served_with_tls_and_another_address_needs_it(start, tmp_pat
     # The answer is no HTTP: a TLS alert.
     with pytest.raises(http.client.BadStatusLine):
         urllib.request.urlopen(url.replace("https", "http"), timeout=10)
-
-
-def as_arguments(parameters: dict[str, object]) -> list[str]:
-    """Parameters as `-p name:=value`."""
-    return [word for name, value in parameters.items() for word in ("-p", f"{name}:={value}")]
 
 
 def test_hostile_input_moves_nothing_and_the_page_works_on(start, decided) -> None:

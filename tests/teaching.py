@@ -241,6 +241,32 @@ def repeat(person: Person, operator: Operator, name: str = NAME) -> Repetition:
         person.reads_otherwise(headline)
 
 
+def correct_first_step(person: Person, operator: Operator, name: str = NAME) -> None:
+    """Has the task repeated, and drags pick and place of the first proposal to where they belong before it is carried out."""
+    color, mark = TASK[0]
+    goals, said = operator.count("goal"), operator.count("pick_place")
+    person.button(f"Repeat {name}").click()
+    operator.next("goal", goals, lambda goal: goal.problem == name)
+    proposal = operator.next("pick_place", said, lambda proposal: proposal.problem == name)
+    person.sees(f"Pick at x {proposal.pick.x:.3f} m, y {proposal.pick.y:.3f} m.")
+    person.can("Approve")
+    person.button("Correct…").click()
+    drag(person, (proposal.pick.x, proposal.pick.y), middle(operator.newest("heightmap"), color))
+    drag(person, (proposal.place.x, proposal.place.y), mark)
+    said = operator.count("pick_place")
+    person.button("Propose this").click()
+    corrected = operator.next("pick_place", said, lambda proposal: proposal.author == person.name)
+    assert (corrected.checkpoint, corrected.step) == ("", 1)
+    person.can("Approve")
+    results = operator.count("step_result")
+    person.button("Approve").click()
+    after = seen_since(operator, operator.next("step_result", results).header.stamp)
+    assert math.dist(middle(after, color), mark) < NEAR_M
+    person.can("It succeeded")
+    person.button("It succeeded").click()
+    person.reads("Step 2 of 3")
+
+
 def main() -> None:
     """Teaches once, repeats from several starts, prints how it went."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])

@@ -38,6 +38,8 @@ STEPS = 6
 START = 10001
 # One more, for what policies are compared with.
 HELD_BACK_START = 10002
+# And one from which a step is corrected.
+CORRECTED_START = 10003
 # Gradient steps of the training in a test.
 TRAINING_STEPS = 8
 
@@ -470,7 +472,14 @@ def test_a_task_that_no_module_programs_is_taught_by_clicks_and_the_shipped_poli
     goal = operator.next("goal", accept=lambda goal: goal.complete)
     assert (goal.problem, goal.step_count) == (teaching.NAME, 3)
 
-    # A policy learns from the one task, is compared on the other, and is used while the graph is at work.
+    # A step of a repetition from one more start is corrected by dragging, and kept.
+    teaching.reset(operator, CORRECTED_START)
+    teaching.correct_first_step(ada, operator)
+    kept = until(lambda: list((tmp_path / "library").glob(".corrections/*/metadata.yaml")), "correction on disk", 20.0)
+    assert len(kept) == 1
+
+    # A policy learns from the one task and the correction, is compared on the other task, and is used while the graph is at work.
+    ada.page.get_by_role("combobox", name=f"1 correction of {teaching.NAME[:12]}").select_option("learn from")
     ada.page.get_by_role("combobox", name=teaching.NAME).select_option("learn from")
     ada.page.get_by_role("combobox", name="held_back").select_option("hold out")
     ada.page.get_by_label("Name of the policy").fill("taught")
@@ -478,6 +487,7 @@ def test_a_task_that_no_module_programs_is_taught_by_clicks_and_the_shipped_poli
     ada.button("Train").click()
     expect(ada.page.get_by_text("taught is trained.")).to_be_visible(timeout=5 * PATIENCE_MS)
     compared = ada.page.get_by_role("table", name="Median distance from 3 held-out steps")
+    assert "training taught on 2 bags" in launch.errors()
     distances = r"pick [0-9.]+ mm, place [0-9.]+ mm, turn [0-9.]+°"
     expect(ada.page.get_by_text(re.compile(rf"Step {TRAINING_STEPS}: {distances} from the held-out steps"))).to_be_visible()
     for policy in ("as shown", "by taught", "by the policy of now"):

@@ -65,8 +65,10 @@ export class Api {
     return response.status === 200 ? response.json() : undefined;
   }
 
+  /** Nothing where there is nothing now. */
   async get(path) {
-    return (await this.#fetch(path, {})).json();
+    const response = await this.#fetch(path, {});
+    return response.status === 204 ? null : response.json();
   }
 
   async text(path) {
@@ -90,6 +92,7 @@ export class Api {
   /** The score maps of pick and place, each as colours without heights, and their number. */
   async scores() {
     const response = await this.#fetch("scores", {});
+    if (response.status === 204) throw new Error("There are no scores of the present proposal.");
     const header = (name) => Number(response.headers.get(name));
     const [rows, width] = [header("x-rows"), header("x-cols")];
     const [rgb, cols] = [new Uint8Array(await response.arrayBuffer()), width / 2];

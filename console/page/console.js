@@ -68,13 +68,11 @@ function need(which, number, load = () => api.heightmap(which)) {
   if (!loading.has(which)) {
     // What a past step has led to is often what the table looks like now: it is not loaded twice.
     const isPresent = /^(before|after)-/.test(which) && state.heightmap?.number === number;
-    const [source, loaded] = isPresent ? [loading.get("present"), pictures.get("present")] : [];
-    const asked = loaded?.number === number ? Promise.resolve(loaded) : source ?? load();
+    const [source, present] = isPresent ? [loading.get("present"), pictures.get("present")] : [];
+    const asked = present?.number === number ? Promise.resolve(present) : source ?? load();
     loading.set(which, asked);
-    asked
-      .then((found) => pictures.set(which, found))
-      .catch(() => {})
-      .finally(() => { loading.delete(which); render(); });
+    // What did not come is asked for again with the next state.
+    asked.then((found) => { pictures.set(which, found); loading.delete(which); render(); }, () => loading.delete(which));
   }
   return null;
 }
@@ -164,7 +162,7 @@ function showCorrection() {
 }
 
 form.addEventListener("input", (event) => {
-  if (event.target.type !== "number") return;
+  if (!correction || event.target.type !== "number") return;
   const number = (name) => form.elements[name].valueAsNumber;
   const next = { pick_x: number("pick_x"), pick_y: number("pick_y"), place_x: number("place_x"), place_y: number("place_y"), turn: number("turn") };
   if (!Object.values(next).every(Number.isFinite)) return;
@@ -351,7 +349,8 @@ async function loadLibrary() {
     for (const [value, words] of [["", "leave out"], ["learn", "learn from"], ["held_out", "hold out"]]) select.append(make("option", { value, textContent: words }));
     select.value = chosen.get(name) ?? "";
     const count = corrections.get(name)?.length;
-    return make("label", {}, count ? `${count} ${name} ` : `${name} `, select);
+    const words = count === 1 ? name.replace(/^corrections/, "1 correction") : count ? `${count} ${name}` : name;
+    return make("label", {}, `${words} `, select);
   });
   $("train-tasks").replaceChildren($("train-tasks").firstElementChild, ...choices);
   $("train").hidden = choices.length < 2;
@@ -470,6 +469,8 @@ boards.now.svg.addEventListener("pointerdown", (event) => {
   const tipDistance = Math.hypot(tipX_m - x_m, tipY_m - y_m);
   const dragged = tipDistance < Math.min(distance(pick), distance(place)) ? "turn" : distance(pick) < distance(place) ? "pick" : "place";
   const drag = (moved) => {
+    // It may have been taken away under the pointer.
+    if (!correction) return;
     const [toX_m, toY_m] = pointed(state.heightmap, svg, moved);
     if (dragged === "turn") place.yaw_rad = pick.yaw_rad + Math.atan2(toY_m - place.y_m, toX_m - place.x_m);
     else Object.assign(correction[dragged], { x_m: toX_m, y_m: toY_m });
@@ -637,7 +638,8 @@ function renderMotion() {
     arm.setMotion(null);
     if (wanted) {
       api.get("motion").then((loaded) => {
-        if (loaded.proposal_id !== motionFor) return;
+        if (motionFor !== wanted) return;
+        if (loaded?.proposal_id !== wanted) return void (motionFor = "");
         motion = loaded;
         arm.setMotion(loaded);
         if (loaded.times_s.length && !matchMedia("(prefers-reduced-motion: reduce)").matches) arm.play();

@@ -11,7 +11,6 @@ use axum::response::{IntoResponse, Response};
 use super::Shared;
 use super::access::Failure;
 use crate::cameras::CameraState;
-use crate::preview::Motion;
 use crate::run::View;
 
 /// Colours (red, green, blue of each cell), then heights (32-bit little-endian floats, in metres).
@@ -70,35 +69,29 @@ pub(super) async fn camera_image(
     Ok(picture(number, height, width, &rgb, &[]))
 }
 
-/// The planned motion of what waits for an approval: of the way home, of the step of a lesson, or of the present proposal.
-pub(super) async fn motion(State(shared): State<Shared>) -> Result<Json<Motion>, Failure> {
+/// The planned motion of what waits for an approval: of the way home, of the step of a lesson, or of the present proposal. No content
+/// where nothing waits, as when it was decided on while a page asked.
+pub(super) async fn motion(State(shared): State<Shared>) -> Response {
     let motion = shared
         .page
         .console
         .read(|state, _| state.pending_motion().cloned());
-    motion.map(Json).ok_or_else(|| {
-        Failure::new(
-            StatusCode::NOT_FOUND,
-            "The executor has planned no motion that waits for an approval.",
-            "Wait a moment.",
-        )
-    })
+    match motion {
+        Some(motion) => Json(motion).into_response(),
+        None => StatusCode::NO_CONTENT.into_response(),
+    }
 }
 
-/// Red, green and blue of each cell of the two score maps.
-pub(super) async fn scores(State(shared): State<Shared>) -> Result<Response, Failure> {
+/// Red, green and blue of each cell of the two score maps; no content where there are none of the present proposal.
+pub(super) async fn scores(State(shared): State<Shared>) -> Response {
     let scores = shared.page.console.read(|state, _| {
         let (number, scores) = state.run.scores()?;
         Some((number, Arc::clone(scores)))
     });
-    let (number, scores) = scores.ok_or_else(|| {
-        Failure::new(
-            StatusCode::NOT_FOUND,
-            "There are no scores of the present proposal.",
-            "Wait a moment.",
-        )
-    })?;
-    Ok(picture(number, scores.rows, scores.cols, &scores.rgb, &[]))
+    match scores {
+        Some((number, scores)) => picture(number, scores.rows, scores.cols, &scores.rgb, &[]),
+        None => StatusCode::NO_CONTENT.into_response(),
+    }
 }
 
 pub(super) async fn robot_description(State(shared): State<Shared>) -> Result<Response, Failure> {

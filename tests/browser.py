@@ -99,11 +99,13 @@ class Person:
         expect(self.page.get_by_text("You decide", exact=True)).to_be_visible()
 
     def finds_no_barrier(self) -> None:
-        """axe-core finds nothing serious: names, roles, contrast, focus."""
+        """axe-core finds nothing serious: names, roles, contrast, focus. Nothing has to be scrolled sideways."""
         found = Axe().run(self.page).response["violations"]
         serious = [(one["id"], [node["html"] for node in one["nodes"]]) for one in found if one["impact"] in ("serious", "critical")]
         if serious:
             raise AssertionError(f"axe-core finds: {serious}")
+        wide = self.page.evaluate("[document.documentElement.scrollWidth, document.documentElement.clientWidth]")
+        assert wide[0] <= wide[1], f"the page is {wide[0]} px wide, of which {wide[1]} are seen"
 
     def close(self) -> None:
         """Leaves; nothing went wrong on the page."""

@@ -276,7 +276,9 @@ def test_a_motion_is_stopped_and_the_run_goes_on_and_a_second_browser_takes_over
     bob.can("Approve")
 
     # Another place than the policy's, by hand: a proposal that is approved as every other.
+    bob.finds_no_barrier()
     bob.button("Correct…").click()
+    bob.finds_no_barrier()
     place_x = bob.page.get_by_label("Place x")
     place_x.fill(str(round(1000 * operator.newest("pick_place").place.x) + 10))
     proposals = operator.count("pick_place")

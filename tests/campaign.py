@@ -21,6 +21,7 @@ import json
 import pathlib
 import queue
 import random
+import signal
 import subprocess
 import sys
 import threading
@@ -49,6 +50,8 @@ from fault_monitor import Kind, Violation
 WATCH_S = 2.5
 # A motion of these proposals takes some 10 s.
 LATEST_S = 9.0
+# The last messages arrive within this time.
+LAST_MESSAGES_S = 0.2
 # Faults that follow each other in one cell.
 FAULTS_OF_A_CELL = 8
 
@@ -145,6 +148,9 @@ def run_cells(faults: list[Planned], seed: int, until_s: float = float("inf")) -
                         line.went_on = went_on = inject(bench, planned.fault, planned.moment_s)
                     except (TimeoutError, AssertionError) as error:
                         line.hung = went_on = str(error) or type(error).__name__
+                    # What is on its way comes.
+                    bench.operator.spin(LAST_MESSAGES_S)
+                    bench.settle()
                     line.violations = [(found.kind.value, found.text) for found in bench.monitor.violations[known:]][:5]
                     print(f"{json.dumps(dataclasses.asdict(line))}", file=sys.stderr, flush=True)
                     yield line
@@ -196,6 +202,7 @@ def run_side_by_side(faults: list[Planned], arguments: list[str], cells: int, un
     shares.sort(key=lambda share: share[0].number)
     lines: queue.SimpleQueue[str | None] = queue.SimpleQueue()
     failed: list[int] = []
+    processes: list[subprocess.Popen[str]] = []
 
     def run(share: list[Planned]) -> None:
         minutes = (until_s - time.monotonic()) / 60.0
@@ -204,6 +211,7 @@ def run_side_by_side(faults: list[Planned], arguments: list[str], cells: int, un
         command = [sys.executable, __file__, *arguments, "--minutes", str(minutes), "--lines"]
         command += ["--numbers", *(str(planned.number) for planned in share)]
         with subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, text=True) as process:
+            processes.append(process)
             for line in process.stdout:
                 lines.put(line)
         if process.returncode:
@@ -215,8 +223,13 @@ def run_side_by_side(faults: list[Planned], arguments: list[str], cells: int, un
         lines.put(None)
 
     threading.Thread(target=run_all, daemon=True).start()
-    while (line := lines.get()) is not None:
-        yield Injected(**json.loads(line))
+    try:
+        while (line := lines.get()) is not None:
+            yield Injected(**json.loads(line))
+    finally:
+        for process in processes:
+            # Where this process is told to end.
+            process.terminate()
     if failed:
         raise SystemExit(f"{len(failed)} of {len(shares)} processes ended with an error: see above")
 
@@ -280,6 +293,7 @@ def planted_campaign(only: str | None = None) -> dict[str, Violation | None]:
                 inject(bench, fault, moment_s)
             except (TimeoutError, AssertionError) as error:
                 print(f"{planted}: the run hangs: {error}", file=sys.stderr, flush=True)
+            bench.settle()
             found = bench.monitor.violations
             first = next((violation for violation in found if violation.kind == expected), None)
             caught[planted] = first
@@ -299,6 +313,8 @@ def same_situations(seed: int) -> list[str]:
 
 
 def main() -> int:
+    # What was started is ended then too.
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--faults", type=int, default=20)
     parser.add_argument("--seed", type=int, default=1)

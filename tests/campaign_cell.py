@@ -5,7 +5,8 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import enum
-import functools
+import heapq
+import itertools
 import os
 import pathlib
 import signal
@@ -28,6 +29,7 @@ from fault_monitor import Monitor
 from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
+from rclpy.qos import HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rosgraph_msgs.msg import Clock
 from sctn_msgs.msg import Heightmap, PickPlace, PlannedMotion, StepConfirmation, StepResult
 from sctn_msgs.srv import ProposeHome
@@ -45,6 +47,11 @@ SUCTION_PIN = 16
 # The driver's actions. The second one answers a goal after 1 to 2 s.
 FOLLOW_ACTION = "scaled_joint_trajectory_controller/follow_joint_trajectory"
 UNTIL_ACTION = "trajectory_until_node/execute"
+# So much later the monitor hears of what was sent and done: by then all messages from before have come.
+REORDER_S = 0.5
+COUNTER = itertools.count()
+# Every reading counts, also where this process is late.
+ALL = QoSProfile(depth=500, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.RELIABLE)
 # Period of /clock where the campaign is its source.
 CLOCK_PERIOD_S = 0.02
 
@@ -91,6 +98,8 @@ class Bench:
     planned_id: int = 0
     # How far /clock is ahead of the wall clock [s].
     clock_ahead_s: float = 0.0
+    # What was sent and done, by when [s], and what the monitor makes of it: it hears of it in that order, a little later.
+    events: list[tuple[float, int, Callable[[], None]]] = dataclasses.field(default_factory=list)
     # When something was done that exposes a fault of the executor: a proposal, an injected fault [s].
     exposed_s: list[float] = dataclasses.field(default_factory=list)
 
@@ -108,7 +117,22 @@ class Bench:
 
     def stopped(self, limit_s: float, again: bool = False) -> None:
         """From now on the arm has so long to come to rest."""
-        self.monitor.on_stop(time.monotonic(), limit_s, again)
+        now = time.monotonic()
+        self.happened(now, lambda: self.monitor.on_stop(now, limit_s, again))
+
+    def void(self, proposal_id: int, reason: str) -> None:
+        """An approval of this proposal must not move the arm from now on."""
+        self.happened(time.monotonic(), lambda: self.monitor.on_void(proposal_id, reason))
+
+    def happened(self, at_s: float, event: Callable[[], None]) -> None:
+        """Something was sent or done. A busy machine delivers messages late, and those of one topic before those of another."""
+        heapq.heappush(self.events, (at_s, next(COUNTER), event))
+        self.settle(time.monotonic() - REORDER_S)
+
+    def settle(self, until_s: float = float("inf")) -> None:
+        """The monitor hears of everything that was sent or done before a time."""
+        while self.events and self.events[0][0] <= until_s:
+            heapq.heappop(self.events)[2]()
 
     def set_fault(self, fault: str) -> None:
         """Sets what is wrong with the simulated robot."""
@@ -148,44 +172,60 @@ def arguments(node: str, **values: object) -> list[object]:
 def watch(bench: Bench) -> None:
     """Connects the monitor to what is said on the domain."""
     monitor = bench.monitor
+    # Of the wall clock's origin, which messages are stamped with, on the monotonic clock [s].
+    origin_s = time.monotonic() - time.time()
+
+    def sent_at(info: dict[str, int]) -> float:
+        """When a message was sent [s]."""
+        return origin_s + 1e-9 * info["source_timestamp"]
 
     def on_confirmation(said: StepConfirmation) -> None:
         if said.decision == StepConfirmation.APPROVE:
-            monitor.on_approval(said.proposal_id, said.operator_name)
+            bench.happened(time.monotonic(), lambda: monitor.on_approval(said.proposal_id, said.operator_name))
 
-    def on_confirmation_of_others(said: StepConfirmation) -> None:
-        if said.operator_name != OPERATOR:
-            on_confirmation(said)
+    def on_confirmation_of_others(said: StepConfirmation, info: dict[str, int]) -> None:
+        if said.operator_name != OPERATOR and said.decision == StepConfirmation.APPROVE:
+            bench.happened(sent_at(info), lambda: monitor.on_approval(said.proposal_id, said.operator_name))
 
-    def on_result(result: StepResult) -> None:
+    def on_proposal(made: PickPlace, info: dict[str, int]) -> None:
+        bench.happened(sent_at(info), lambda: monitor.on_proposal(made.id))
+
+    def on_result(result: StepResult, info: dict[str, int]) -> None:
         if result.outcome not in (StepResult.REFUSED, StepResult.REJECTED):
-            monitor.on_end(result.proposal_id, time.monotonic())
+            bench.happened(sent_at(info), lambda: monitor.on_end(result.proposal_id, sent_at(info)))
 
-    def on_plan(plan: PlannedMotion) -> None:
+    def on_plan(plan: PlannedMotion, info: dict[str, int]) -> None:
         bench.planned_id = plan.proposal_id
-        monitor.on_plan(plan.proposal_id)
+        bench.happened(sent_at(info), lambda: monitor.on_plan(plan.proposal_id))
 
-    def on_pins(pins: IOStates) -> None:
-        bench.suction = any(output.pin == SUCTION_PIN and output.state for output in pins.digital_out_states)
-        monitor.on_suction(bench.suction, time.monotonic())
+    def on_pins(pins: IOStates, info: dict[str, int]) -> None:
+        suction = any(output.pin == SUCTION_PIN and output.state for output in pins.digital_out_states)
+        bench.suction = suction
+        bench.happened(sent_at(info), lambda: monitor.on_suction(suction, sent_at(info)))
 
-    def on_goals(action: str, goals: GoalStatusArray) -> None:
+    def on_goals(action: str, goals: GoalStatusArray, info: dict[str, int]) -> None:
         statuses = {bytes(one.goal_info.goal_id.uuid): one.status for one in goals.status_list}
-        monitor.on_goals(action, statuses, time.monotonic(), answers_late=action == UNTIL_ACTION)
+        late = action == UNTIL_ACTION
+        bench.happened(sent_at(info), lambda: monitor.on_goals(action, statuses, sent_at(info), answers_late=late))
+
+    def on_joints(read: JointState, info: dict[str, int]) -> None:
+        bench.happened(sent_at(info), lambda: monitor.on_joints(read.position, sent_at(info)))
+
+    def goals_of(action: str) -> Callable[[GoalStatusArray, dict[str, int]], None]:
+        return lambda goals, info: on_goals(action, goals, info)
 
     node = bench.operator.node
     if bench.layout is Layout.CLOCK:
         clock = node.create_publisher(Clock, "/clock", STREAM)
         node.create_timer(CLOCK_PERIOD_S, lambda: clock.publish(Clock(clock=time_message(time.time() + bench.clock_ahead_s))))
-    node.create_subscription(PickPlace, "pick_place", lambda made: monitor.on_proposal(made.id), LATCHED)
+    node.create_subscription(PickPlace, "pick_place", on_proposal, LATCHED)
     node.create_subscription(PlannedMotion, "planned_motion", on_plan, LATCHED)
-    # An approval counts from when it is given: readings of the arm that it moves may overtake it on its way back.
     bench.operator.before_confirmation = on_confirmation
     node.create_subscription(StepConfirmation, "step_confirmation", on_confirmation_of_others, EVENT)
     node.create_subscription(StepResult, "step_result", on_result, EVENT)
     for action in (FOLLOW_ACTION, UNTIL_ACTION):
-        node.create_subscription(GoalStatusArray, f"{action}/_action/status", functools.partial(on_goals, action), LATCHED)
-    node.create_subscription(JointState, "joint_states", lambda read: monitor.on_joints(read.position, time.monotonic()), STREAM)
+        node.create_subscription(GoalStatusArray, f"{action}/_action/status", goals_of(action), LATCHED)
+    node.create_subscription(JointState, "joint_states", on_joints, ALL)
     node.create_subscription(IOStates, "io_and_status_controller/io_states", on_pins, STREAM)
 
 
@@ -284,7 +324,7 @@ def recover(bench: Bench) -> None:
         bench.executor = bench.start_executor()
         operator.until(lambda: bench.confirmation_readers() - before, "executor that was started again", 30.0)
     if bench.fault == "driver_dead":
-        bench.monitor.on_lost_sight()
+        bench.happened(time.monotonic(), bench.monitor.on_lost_sight)
     bench.set_fault("none")
     operator.states.clear()
     operator.until(operator.executor_is_ready, "executor that is ready again", 60.0)

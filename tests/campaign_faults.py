@@ -152,7 +152,7 @@ def stale_view(bench: Bench) -> None:
     stop(bench)
     bench.operator.spin(0.6)
     proposal = propose(bench)
-    bench.monitor.on_void(proposal.id, "its view is old")
+    bench.void(proposal.id, "its view is old")
     bench.operator.spin(OLD_S)
     bench.operator.confirm(proposal.id, StepConfirmation.APPROVE)
 
@@ -171,7 +171,7 @@ def spoofed_proposals(bench: Bench) -> None:
 
     def approve(change: Callable[[PickPlace], None]) -> None:
         proposal = propose(bench, change)
-        bench.monitor.on_void(proposal.id, "it makes no sense")
+        bench.void(proposal.id, "it makes no sense")
         bench.operator.spin(0.1)
         bench.operator.confirm(proposal.id, StepConfirmation.APPROVE)
 

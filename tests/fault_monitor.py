@@ -10,6 +10,8 @@ from collections.abc import Mapping
 MOVING_RAD = 5e-4
 # By how much messages of different topics may overtake each other.
 OVERTAKING_S = 0.05
+# A release that was asked for before a stop is carried out after it.
+RELEASE_S = 0.1
 # An arm that has not moved for so long has come to rest: what comes then is another motion.
 REST_TIME_S = 0.2
 # Status of a goal in action_msgs/GoalStatus: accepted, executing and cancelling ones move the arm.
@@ -19,6 +21,8 @@ CANCELED, ABORTED = 5, 6
 LATE_GOAL_S = 0.3
 # ... and by so much: a descent to contact is slow, 0.05 m/s, some 0.1 rad/s.
 LATE_GOAL_RAD = 0.05
+# The driver says so within this time of the beginning of the motion.
+NEWS_S = 0.15
 # A driver has accepted by then whatever it was sent before a stop: within 2 s, until_answer_max_s of config/hardware/realistic.yaml,
 # after it has reached it, which a driver that stood still or a network that was parted delays by as much.
 ANSWER_S = 4.0
@@ -131,7 +135,7 @@ class Monitor:
     def on_suction(self, on: bool, now: float) -> None:
         """A reading of the output that switches suction: a stop leaves it as it is."""
         was_on, self._suction = self._suction, on
-        if was_on and not on and self._stopped_at is not None:
+        if was_on and not on and self._stopped_at is not None and now - self._stopped_at > RELEASE_S:
             text = f"suction is switched off {now - self._stopped_at:.2f} s after a stop: what is held is dropped"
             self._violate(Kind.DROPPED, text, now)
 
@@ -147,7 +151,9 @@ class Monitor:
         under_way = [goal for goal, status in statuses.items() if status in UNDER_WAY]
         if new and (replaced or len(under_way) > 1):
             self._violate(Kind.TWO_GOALS, "a goal takes the place of one under way: two executors act on one approval", now)
-        if new and answers_late and self._may_be_unanswered and self._stopped_at is not None:
+        # Only the newest statuses of an action are kept: that it was under way may never have been heard.
+        accepted = new or [goal for goal, status in statuses.items() if goal not in before and status == CANCELED]
+        if accepted and answers_late and self._may_be_unanswered and self._stopped_at is not None:
             self._may_be_unanswered = False
             if now - self._stopped_at <= ANSWER_S + OVERTAKING_S:
                 self._late_goal_at, self._late_from = now, self._positions
@@ -190,7 +196,7 @@ class Monitor:
 
     def _is_overtaking(self, found: Violation, now: float) -> bool:
         """Whether a violation is a motion that began just before now."""
-        return found.kind in (Kind.AFTER_STOP, Kind.UNAPPROVED) and now - found.at_s <= OVERTAKING_S and self._moving is not None
+        return found.kind in (Kind.AFTER_STOP, Kind.UNAPPROVED) and now - found.at_s <= NEWS_S and self._moving is not None
 
     def _violate(self, kind: Kind, text: str, now: float) -> None:
         self.violations.append(Violation(kind, text, now))

@@ -177,6 +177,13 @@ def test_the_first_readings_of_a_late_motion_may_overtake_the_news_of_its_goal(m
     assert not monitor.violations
 
 
+def test_a_late_goal_that_is_first_heard_of_when_it_is_cancelled_is_a_late_goal(monitor: Monitor) -> None:
+    stopped_before_an_answer(monitor)
+    monitor.on_goals("until", {b"b": 5}, 2.0, answers_late=True)
+    descend(monitor, 2.0, 2.3)
+    assert not monitor.violations
+
+
 def test_an_arm_whose_driver_stood_still_has_to_rest_soon_after_it_goes_on(monitor: Monitor) -> None:
     monitor.on_approval(2, "anna")
     move(monitor, 1.0)

@@ -10,13 +10,13 @@ from collections.abc import Mapping
 MOVING_RAD = 5e-4
 # By how much messages of different topics may overtake each other.
 OVERTAKING_S = 0.05
-# A release that was asked for before a stop is carried out after it.
-RELEASE_S = 0.1
+# What stands where it is to be placed may be released so long after a stop: that was asked for before the stop.
+RELEASE_S = 0.4
 # An arm that has not moved for so long has come to rest: what comes then is another motion.
 REST_TIME_S = 0.2
 # Status of a goal in action_msgs/GoalStatus: accepted, executing and cancelling ones move the arm.
 UNDER_WAY = (1, 2, 3)
-CANCELED, ABORTED = 5, 6
+SUCCEEDED, CANCELED, ABORTED = 4, 5, 6
 # A goal that the driver accepts after the stop can be cancelled only then: the arm may move for so long, ...
 LATE_GOAL_S = 0.3
 # ... and by so much: a descent to contact is slow, 0.05 m/s, some 0.1 rad/s.
@@ -75,6 +75,8 @@ class Monitor:
     _positions: list[float] | None = None
     _moved_at: float = 0.0
     _suction: bool = False
+    # Whether a descent has ended at contact since suction was switched on.
+    _is_placed: bool = False
     # Proposals whose approval must not move the arm, and why.
     _voided: dict[int, str] = dataclasses.field(default_factory=dict)
     # Status of each goal of each action of the driver.
@@ -135,7 +137,10 @@ class Monitor:
     def on_suction(self, on: bool, now: float) -> None:
         """A reading of the output that switches suction: a stop leaves it as it is."""
         was_on, self._suction = self._suction, on
-        if was_on and not on and self._stopped_at is not None and now - self._stopped_at > RELEASE_S:
+        if on and not was_on:
+            self._is_placed = False
+        released = self._is_placed and self._stopped_at is not None and now - self._stopped_at <= RELEASE_S
+        if was_on and not on and self._stopped_at is not None and not released:
             text = f"suction is switched off {now - self._stopped_at:.2f} s after a stop: what is held is dropped"
             self._violate(Kind.DROPPED, text, now)
 
@@ -146,6 +151,7 @@ class Monitor:
         """
         before = self._goals.get(action, {})
         self._goals[action] = dict(statuses)
+        self._is_placed |= answers_late and any(status == SUCCEEDED and before.get(goal) != SUCCEEDED for goal, status in statuses.items())
         new = [goal for goal, status in statuses.items() if goal not in before and status in UNDER_WAY]
         replaced = [goal for goal, status in statuses.items() if status in (CANCELED, ABORTED) and before.get(goal, 1) in UNDER_WAY]
         under_way = [goal for goal, status in statuses.items() if status in UNDER_WAY]

@@ -108,6 +108,24 @@ def test_the_monitor_catches_a_part_that_a_stop_drops(monitor: Monitor) -> None:
     assert "suction is switched off 0.50 s after a stop" in str(monitor.violations[0])
 
 
+def test_a_part_that_stands_at_its_place_may_be_released_as_a_stop_comes_and_no_other(monitor: Monitor) -> None:
+    monitor.on_approval(2, "anna")
+    monitor.on_goals("until", {b"pick": 4}, 1.0, answers_late=True)
+    monitor.on_suction(True, 1.1)
+    monitor.on_goals("until", {b"pick": 4, b"place": 4}, 2.0, answers_late=True)
+    monitor.on_stop(2.1, 0.3)
+    monitor.on_suction(False, 2.2)
+    assert not monitor.violations
+    monitor.on_approval(3, "anna")
+    monitor.on_proposal(4)
+    monitor.on_approval(4, "anna")
+    # It was picked, and stands nowhere.
+    monitor.on_suction(True, 3.0)
+    monitor.on_stop(3.1, 0.3)
+    monitor.on_suction(False, 3.1)
+    assert [found.kind for found in monitor.violations] == [Kind.DROPPED]
+
+
 def test_the_monitor_catches_a_way_home_that_nobody_has_approved(monitor: Monitor) -> None:
     monitor.on_plan(2)
     monitor.on_plan(70)

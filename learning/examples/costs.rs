@@ -1,6 +1,6 @@
 //! What decisions and training samples cost in processor time, and what comes out of them: to compare builds of two commits, run in turn.
 //!
-//! `costs decide CHECKPOINT REPEAT FOLDER...`: decides each step of the demonstrations in the folders, so many times, shown
+//! `costs decide|decide-bf16 CHECKPOINT REPEAT FOLDER...`: decides each step of the demonstrations in the folders, so many times, shown
 //! the demonstration of its scene that began from another start where there is one. Prints one line for each decision, then the
 //! mean processor time of one.
 //!
@@ -10,8 +10,8 @@
 use bags::Demonstration;
 use cpu_time::ProcessTime;
 use gctn::{
-    Augmentation, Goal, GoalConditioning, Interpolation, Matching, Network, NetworkConfig, Policy,
-    Precision, Sample, SensorNoise, Trainer, TrainingConfig,
+    Augmentation, Device, Goal, GoalConditioning, Interpolation, Matching, Network, NetworkConfig,
+    Policy, Precision, Sample, SensorNoise, Trainer, TrainingConfig,
 };
 use learning::goal;
 use std::error::Error;
@@ -67,8 +67,13 @@ fn samples(all: &[Demonstration], conditioning: GoalConditioning) -> Vec<Sample<
     samples
 }
 
-fn decide(checkpoint: &str, repeat: u32, folders: &[String]) -> Result<(), Box<dyn Error>> {
-    let policy = Policy::load(Path::new(checkpoint))?;
+fn decide(
+    checkpoint: &str,
+    precision: Precision,
+    repeat: u32,
+    folders: &[String],
+) -> Result<(), Box<dyn Error>> {
+    let policy = Policy::load_for(Path::new(checkpoint), Device::Cpu, precision)?;
     let all = demonstrations(folders)?;
     let samples = samples(&all, policy.config().conditioning);
     let mut lines = Vec::new();
@@ -175,7 +180,8 @@ fn main() -> Result<(), Box<dyn Error>> {
         [command, what, number, folders @ ..] if !folders.is_empty() => {
             gctn::set_threads(1);
             match &**command {
-                "decide" => return decide(what, number.parse()?, folders),
+                "decide" => return decide(what, Precision::F32, number.parse()?, folders),
+                "decide-bf16" => return decide(what, Precision::Bf16, number.parse()?, folders),
                 "train" => return train(what, number.parse()?, folders),
                 _ => {}
             }

@@ -10,7 +10,7 @@ from contextlib import contextmanager
 
 import pytest
 from axe_playwright_python.sync_playwright import Axe
-from playwright.sync_api import Browser, Locator, Page, expect, sync_playwright
+from playwright.sync_api import Browser, BrowserType, Locator, Page, expect, sync_playwright
 from processes import Process
 
 CHROMIUM = next((found for name in ("chromium", "chromium-browser", "google-chrome") if (found := shutil.which(name))), None)
@@ -18,6 +18,12 @@ CHROMIUM = next((found for name in ("chromium", "chromium-browser", "google-chro
 # Two busy cores: a policy, a simulator and a browser beside each other.
 PATIENCE_MS = 60_000
 expect.set_options(timeout=PATIENCE_MS)
+
+
+def launched(kind: BrowserType) -> Browser:
+    """One more Chromium, with processes of its own."""
+    # The sandbox needs rights that containers do not give.
+    return kind.launch(executable_path=CHROMIUM, args=["--no-sandbox", "--disable-gpu"])
 
 
 @contextmanager
@@ -29,8 +35,7 @@ def chromium() -> Iterator[Browser]:
             pytest.fail(reason)
         pytest.skip(reason)
     with sync_playwright() as playwright:
-        # The sandbox needs rights that containers do not give.
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox", "--disable-gpu"])
+        browser = launched(playwright.chromium)
         try:
             yield browser
         finally:
@@ -46,6 +51,16 @@ def address_of(launch: Process, until: Callable[[Callable[[], object], str, floa
         return found and found.group(1)
 
     return until(printed, "address of the operator's page", 90.0)
+
+
+def no_barrier(page: Page) -> None:
+    """axe-core finds nothing serious: names, roles, contrast, focus. Nothing has to be scrolled sideways."""
+    found = Axe().run(page).response["violations"]
+    serious = [(one["id"], [node["html"] for node in one["nodes"]]) for one in found if one["impact"] in ("serious", "critical")]
+    if serious:
+        raise AssertionError(f"axe-core finds: {serious}")
+    wide = page.evaluate("[document.documentElement.scrollWidth, document.documentElement.clientWidth]")
+    assert wide[0] <= wide[1], f"the page is {wide[0]} px wide, of which {wide[1]} are seen"
 
 
 class Person:
@@ -81,6 +96,14 @@ class Person:
         """Waits until these words are on the page."""
         expect(self.page.get_by_text(text)).to_be_visible()
 
+    def reaches(self, what: Locator) -> None:
+        """Goes to something by the Tab key alone."""
+        for _ in range(100):
+            if what.evaluate("element => element === document.activeElement"):
+                return
+            self.page.keyboard.press("Tab")
+        raise AssertionError(f"the Tab key does not lead to {what}")
+
     def headline(self) -> str:
         """What the headline says now."""
         return self.page.get_by_role("heading", level=2).first.inner_text()
@@ -99,13 +122,8 @@ class Person:
         expect(self.page.get_by_text("You decide", exact=True)).to_be_visible()
 
     def finds_no_barrier(self) -> None:
-        """axe-core finds nothing serious: names, roles, contrast, focus. Nothing has to be scrolled sideways."""
-        found = Axe().run(self.page).response["violations"]
-        serious = [(one["id"], [node["html"] for node in one["nodes"]]) for one in found if one["impact"] in ("serious", "critical")]
-        if serious:
-            raise AssertionError(f"axe-core finds: {serious}")
-        wide = self.page.evaluate("[document.documentElement.scrollWidth, document.documentElement.clientWidth]")
-        assert wide[0] <= wide[1], f"the page is {wide[0]} px wide, of which {wide[1]} are seen"
+        """See `no_barrier`."""
+        no_barrier(self.page)
 
     def close(self) -> None:
         """Leaves; nothing went wrong on the page."""

@@ -22,7 +22,10 @@ def picture(page: Page, folder: pathlib.Path, name: str) -> None:
     for size, (width, height) in SIZES.items():
         page.set_viewport_size({"width": width, "height": height})
         page.wait_for_timeout(300)
-        page.screenshot(path=folder / f"console_{name}_{size}.png", full_page=True)
+        # All of it in view: what sticks to an edge of the window hides nothing.
+        page.set_viewport_size({"width": width, "height": page.evaluate("document.documentElement.scrollHeight")})
+        page.wait_for_timeout(300)
+        page.screenshot(path=folder / f"console_{name}_{size}.png")
         wider = page.evaluate("document.documentElement.scrollWidth > innerWidth")
         assert not wider, f"{name}: the page is wider than {width} pixels"
 

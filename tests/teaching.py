@@ -38,6 +38,8 @@ TASK = [("blue", (0.37, 0.2)), ("red", (0.5, 0.2)), ("green", (0.63, 0.2))]
 COLORS = {"red": (255, 87, 89), "green": (89, 161, 79), "blue": (78, 121, 167)}
 # A block of 50 mm lies on its mark of 100 mm where its middle is not further from that of the mark [m].
 NEAR_M = 0.025
+# How far beside its middle a block is clicked, along each axis [m].
+BESIDE_M = 0.01
 # Proposals for a step that are looked at before a person gives up.
 MOST_PROPOSALS = 5
 
@@ -89,6 +91,11 @@ def leads_to(proposal: PickPlace, block: tuple[float, float]) -> tuple[float, fl
     )
 
 
+def shows(person: Person, proposal: PickPlace) -> None:
+    """Waits until the page shows a proposal."""
+    person.sees(f"Pick at x {1000 * proposal.pick.x:.0f} mm, y {1000 * proposal.pick.y:.0f} mm.")
+
+
 def reset(operator: Operator, seed: int) -> None:
     """The blocks lie elsewhere, as this seed has them; returns when that is in view."""
     client = operator.node.create_client(ResetCell, "sim_workcell/reset")
@@ -104,7 +111,7 @@ def reset(operator: Operator, seed: int) -> None:
 def on_page(person: Person, x_m: float, y_m: float) -> tuple[float, float]:
     """Where a place of the world frame is on the picture of the table, in pixels of the page."""
     table = person.page.get_by_role("img", name="The table now, from above")
-    table.scroll_into_view_if_needed()
+    table.evaluate("table => table.scrollIntoView({ block: 'center' })")
     box = table.bounding_box()
     # The robot looks up: x up, y to the left.
     return box["x"] + (0.5 - y_m) * box["width"], box["y"] + (0.75 - x_m) / 0.5 * box["height"]
@@ -147,8 +154,12 @@ def choose(person: Person, operator: Operator, shown: int) -> None:
     """Clicks pick and place of a step of the task, counted from 0."""
     color, mark = TASK[shown]
     person.sees(f"Lesson, {shown} {'step' if shown == 1 else 'steps'} so far. Click what to pick")
-    click(person, *middle(operator.newest("heightmap"), color))
+    block = middle(operator.newest("heightmap"), color)
+    # Wherever the block is clicked, its middle is picked.
+    click(person, block[0] + BESIDE_M, block[1] - BESIDE_M)
     person.sees("Now click where to place it.")
+    picked = [0.001 * float(person.page.get_by_label(f"Pick {axis}").input_value()) for axis in "xy"]
+    assert math.dist(picked, block) < 0.6 * BESIDE_M, (picked, block)
     click(person, *mark)
 
 
@@ -174,6 +185,7 @@ def carry_out(person: Person) -> None:
     person.can("Carry it out")
     expect(person.page.get_by_text(re.compile(r"The planned motion takes \d"))).to_be_visible()
     person.button("Carry it out").click()
+    expect(person.button("Carry it out")).to_be_hidden()
 
 
 def save(person: Person, name: str) -> None:
@@ -196,7 +208,7 @@ def repeat(person: Person, operator: Operator, name: str = NAME) -> Repetition:
     def next_proposal() -> PickPlace:
         """Another proposal than those that were looked at, once the page shows it."""
         found = operator.next("pick_place", said, lambda proposal: proposal.problem == name and proposal.id not in looked_at)
-        person.sees(f"Pick at x {found.pick.x:.3f} m, y {found.pick.y:.3f} m.")
+        shows(person, found)
         return found
 
     # Until then the page may say what it said before.
@@ -248,7 +260,9 @@ def correct_first_step(person: Person, operator: Operator, name: str = NAME) -> 
     person.button(f"Repeat {name}").click()
     operator.next("goal", goals, lambda goal: goal.problem == name)
     proposal = operator.next("pick_place", said, lambda proposal: proposal.problem == name)
-    person.sees(f"Pick at x {proposal.pick.x:.3f} m, y {proposal.pick.y:.3f} m.")
+    shows(person, proposal)
+    # The policy says how likely its proposal is to succeed.
+    expect(person.page.get_by_text(re.compile(r"It expects the step to succeed with \d+ %\."))).to_be_visible()
     person.can("Approve")
     person.button("Correct…").click()
     drag(person, (proposal.pick.x, proposal.pick.y), middle(operator.newest("heightmap"), color))
@@ -285,6 +299,7 @@ def main() -> None:
             person = Person(browser, address_of(launch, lambda found, what, limit: operator.until(found, what, limit)), "Ada")
             person.takes_control()
             operator.next("heightmap")
+            operator.until(operator.executor_is_ready, "executor that has checked its driver", 60.0)
             person.button("Teach a new task").click()
             for shown in range(len(TASK)):
                 show(person, operator, shown)

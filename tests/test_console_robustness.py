@@ -10,6 +10,8 @@ import os
 import pathlib
 import random
 import signal
+import socket
+import struct
 import time
 import urllib.parse
 
@@ -179,6 +181,54 @@ def test_random_input_of_somebody_with_the_token_moves_nothing_and_the_page_work
     assert ada.state()["proposal"]["id"] == proposal["id"]
     operator.spin(0.5)
     assert said == [] and operator.count("pick_place") == proposals
+    ada.decide("approve", approvable(ada))
+    ada.wait("awaiting_confirmation")
+
+
+def test_messages_of_100_mb_are_refused_and_take_no_memory(start, tmp_path: pathlib.Path) -> None:
+    start("sctn", "launch", "--problem", "stacking", "--seed", 10026, "--operator", "none")
+    process, address = console_process(start, tmp_path / "address")
+    ada = CLIENT.Console(address, "Ada")
+    ada.take_control()
+    approvable(ada)
+    url = urllib.parse.urlsplit(address)
+    before_kb = resident_kb(process)
+    large = bytes(1 << 20)
+
+    def pushed(connection: socket.socket) -> int:
+        """How many of 100 MB the console takes before it hangs up."""
+        sent = 0
+        try:
+            for _ in range(100):
+                connection.sendall(large)
+                sent += len(large)
+        except OSError:
+            pass
+        return sent
+
+    # As a WebSocket message, as one of many fragments, as a body with a length, and as one without.
+    session = ada._headers["X-Session"]
+    whole = WebSocket(address, session)
+    whole.socket.sendall(struct.pack("!BBQ", 0x81, 0x80 | 127, 100 * len(large)) + bytes(4))
+    taken = [pushed(whole.socket)]
+    fragments = WebSocket(address, session)
+    try:
+        for number in range(100_000):
+            fragments.socket.sendall(struct.pack("!BBH", 0x01 if number == 0 else 0x00, 0x80 | 126, 1000) + bytes(1004))
+        raise AssertionError("100 MB in fragments were taken")
+    except OSError:
+        pass
+    head = f"POST /api/v1/decisions HTTP/1.1\r\nHost: {url.netloc}\r\nAuthorization: {ada._headers['Authorization']}\r\n"
+    head += f"X-Session: {session}\r\nContent-Type: application/json\r\n"
+    for kind in ("Content-Length: 104857600\r\n\r\n", f"Transfer-Encoding: chunked\r\n\r\n{104857600:x}\r\n"):
+        with socket.create_connection((url.hostname, url.port), timeout=10) as connection:
+            connection.sendall((head + kind).encode())
+            taken.append(pushed(connection))
+    print(f"taken before the console hung up: {[round(count / 2**20) for count in taken]} MB")
+    assert max(taken) < 20 * len(large)
+    grown_kb = resident_kb(process) - before_kb
+    print(f"{grown_kb} kB more")
+    assert grown_kb < 4096
     ada.decide("approve", approvable(ada))
     ada.wait("awaiting_confirmation")
 

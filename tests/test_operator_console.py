@@ -24,9 +24,9 @@ from typing import Any
 
 import pytest
 import teaching
-from browser import PATIENCE_MS, Person, address_of, chromium
+from browser import PATIENCE_MS, Person, address_of, chromium, launched, no_barrier
 from cell_operator import EVENT, Operator, nanoseconds
-from playwright.sync_api import Browser, expect
+from playwright.sync_api import Browser, Locator, expect
 from processes import REPOSITORY, Process
 from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter
@@ -129,9 +129,10 @@ def test_a_person_rejects_once_and_then_approves_a_run_of_stacking_to_its_end_by
 ) -> None:
     launch, address = launch_web(start, 10000, "--record", tmp_path / "record")
     ada = Person(browser, address, "Ada")
-    ada.button("Take control").focus()
+    ada.reaches(ada.button("Take control"))
     ada.page.keyboard.press("Enter")
     ada.reads("Step 1 of 6: the policy proposes")
+    expect(ada.page.get_by_role("listitem").filter(has_text="Step 1 (now)")).to_have_attribute("aria-current", "step")
     ada.can("Approve")
     # What is proposed is seen from everywhere before it is approved.
     expect(ada.page.get_by_text(re.compile("Made by gctn_policy with ten_problems"))).to_be_visible()
@@ -140,26 +141,42 @@ def test_a_person_rejects_once_and_then_approves_a_run_of_stacking_to_its_end_by
     slider = ada.page.get_by_role("slider", name="Time")
     robot = ada.page.get_by_role("img", name="The robot in its cell")
     drawn = []
-    for share in (0.0, 0.5):
-        slider.evaluate("(slider, share) => { slider.value = share * slider.max; slider.dispatchEvent(new Event('input')); }", share)
+    ada.reaches(slider)
+    for key in ("Home", "PageUp", "PageUp"):
+        ada.page.keyboard.press(key)
         drawn.append(robot.evaluate("canvas => canvas.toDataURL()"))
-    assert drawn[0] != drawn[1]
+    assert len(set(drawn)) == 3
     ada.page.keyboard.press("p")
-    ada.button("Pause").click()
-    ada.page.get_by_role("heading", name="Camera views").click()
+    ada.reaches(ada.button("Pause"))
+    ada.page.keyboard.press("Enter")
+    cameras = ada.page.locator("summary").filter(has_text="Camera views")
+    ada.reaches(cameras)
+    ada.page.keyboard.press("Enter")
     views = [ada.page.get_by_role("img", name=f"What the {name} camera sees") for name in ("front", "left", "right")]
+
+    def pixels(view: Locator, condition: str) -> int:
+        """How many pixels of an image have such red, green and blue (d[i], d[i + 1], d[i + 2])."""
+        count = "c => { const d = c.getContext('2d').getImageData(0, 0, c.width, c.height).data; let n = 0; "
+        return view.evaluate(count + f"for (let i = 0; i < d.length; i += 4) n += {condition}; return n; }}")
+
+    # The place is marked in its colour, and where the policy would place shines blue.
+    marked, blue = "d[i] === 92 && d[i + 1] === 214 && d[i + 2] === 192", "d[i] < 70 && d[i + 2] > 160"
     for view in views:
         expect(view).to_be_visible()
-        # The place is marked in its colour.
-        count = "c => { const d = c.getContext('2d').getImageData(0, 0, c.width, c.height).data; let n = 0; "
-        count += "for (let i = 0; i < d.length; i += 4) n += d[i] === 92 && d[i + 1] === 214 && d[i + 2] === 192; return n; }"
-        until(lambda view=view, count=count: view.evaluate(count) > 20, "mark on a camera's image", 20.0)
-    ada.page.get_by_role("heading", name="Camera views").click()
+        until(lambda view=view: pixels(view, marked) > 20, "mark on a camera's image", 20.0)
+    unscored = [pixels(view, blue) for view in views]
     table = ada.page.get_by_role("img", name="The table now, from above")
     seen = table.evaluate("canvas => canvas.toDataURL()")
-    ada.page.get_by_label("Place scores").check()
+    ada.reaches(ada.page.get_by_label("Colour"))
+    ada.page.keyboard.press("ArrowUp")
+    expect(ada.page.get_by_label("Place scores")).to_be_checked()
     until(lambda: table.evaluate("canvas => canvas.toDataURL()") != seen, "scores", 20.0)
-    ada.page.get_by_label("Colour").check()
+    for view, before in zip(views, unscored, strict=True):
+        until(lambda view=view, before=before: pixels(view, blue) > before + 10, "scores on a camera's image", 20.0)
+    ada.page.keyboard.press("ArrowDown")
+    expect(ada.page.get_by_label("Colour")).to_be_checked()
+    ada.reaches(cameras)
+    ada.page.keyboard.press("Enter")
     ada.finds_no_barrier()
     ada.page.keyboard.press("r")
     ada.reads("Step 1 of 6, attempt 2")
@@ -186,6 +203,10 @@ def test_a_person_rejects_once_and_then_approves_a_run_of_stacking_to_its_end_by
         expect(ada.page.get_by_role("heading", level=2).first).not_to_have_text(headline)
         assert keys < 40, ada.headline()
     ada.reads("All steps are done")
+    # Each step is shown with what was before and after it.
+    for step in range(1, STEPS + 1):
+        for when in ("Before", "After"):
+            expect(ada.page.get_by_role("img", name=f"{when} step {step}").first).to_be_attached()
     ada.close()
     assert launch.wait(60.0) == 0, launch.log()
     assert "completed" in launch.output()
@@ -235,8 +256,10 @@ def test_a_motion_is_stopped_and_the_run_goes_on_and_a_second_browser_takes_over
     os.kill(fusion, signal.SIGSTOP)
     ada.cannot("Approve")
     expect(ada.page.get_by_role("status").filter(has_text="camera_fusion is stale")).to_be_visible()
+    assert is_greyed(ada)
     os.kill(fusion, signal.SIGCONT)
     ada.can("Approve")
+    assert not is_greyed(ada)
 
     # Stopped in mid-motion, by button.
     slow_down(operator, 1.0)
@@ -323,6 +346,80 @@ def test_a_motion_is_stopped_and_the_run_goes_on_and_a_second_browser_takes_over
     bob.close()
 
 
+def test_a_run_is_corrected_stopped_continued_and_handed_over_by_keyboard_alone(
+    browser: Browser, start, operator: Operator, decided
+) -> None:
+    _, address = launch_web(start, 10022)
+    # What somebody sees first has no barrier either.
+    with browser.new_context() as context:
+        page = context.new_page()
+        page.goto(address)
+        expect(page.get_by_role("heading", name="Who are you?")).to_be_visible()
+        no_barrier(page)
+    ada = Person(browser, address, "Ada")
+    bob = Person(browser, address, "Bob", width=390, height=844)
+    keyboard = ada.page.keyboard
+    ada.reaches(ada.button("Take control"))
+    keyboard.press("Enter")
+    ada.can("Approve")
+    # Corrected: what is typed is proposed, and the next key decides on it.
+    proposals = operator.count("pick_place")
+    keyboard.press("e")
+    place_x = ada.page.get_by_label("Place x")
+    ada.reaches(place_x)
+    typed = round(1000 * operator.next("pick_place").place.x) + 10
+    keyboard.type(str(typed))
+    keyboard.press("Enter")
+    corrected = operator.next("pick_place", proposals, lambda proposal: proposal.author == "Ada")
+    assert round(1000 * corrected.place.x) == typed
+    expect(ada.button("Approve")).to_be_focused()
+    ada.can("Approve")
+    # Stopped in mid-motion.
+    slow_down(operator, 1.0)
+    results = operator.count("step_result")
+    keyboard.press("a")
+    ada.reads("the arm moves")
+    keyboard.press("s")
+    ada.reads("stopped")
+    assert operator.next("step_result", results).outcome == StepResult.STOPPED
+    slow_down(operator, 0.0)
+    said = [(one.proposal_id, one.decision) for one in decided()]
+    assert said[0] == (corrected.id, StepConfirmation.APPROVE)
+    assert said[1][1] == StepConfirmation.STOP
+    keyboard.press("h")
+    ada.can("Go home this way")
+    keyboard.press("g")
+    ada.sees("The arm is at home.")
+    keyboard.press("c")
+    ada.reads("proposes")
+    ada.can("Approve")
+    # Control is handed over: the first can no longer approve, the other can.
+    ada.reaches(ada.button("Hand over to Bob"))
+    keyboard.press("Enter")
+    ada.sees("You watch. Bob decides")
+    expect(bob.page.get_by_text("You decide", exact=True)).to_be_visible()
+    ada.cannot("Approve")
+    keyboard.press("a")
+    # Whoever holds a phone sees what is decided, and the stop, without scrolling.
+    for name in ("Approve", "Stop"):
+        expect(bob.button(name)).to_be_in_viewport(ratio=1.0)
+    bob.finds_no_barrier()
+    bob.can("Approve")
+    decisions = len(decided())
+    bob.reaches(bob.button("Approve"))
+    bob.page.keyboard.press("Enter")
+    bob.reads("did it succeed")
+    assert [(one.operator_name, one.decision) for one in decided()[decisions:]] == [("Bob", StepConfirmation.APPROVE)]
+    ada.close()
+    bob.close()
+
+
+def is_greyed(person: Person) -> bool:
+    """Whether the picture of the table is shown without its colours, as what may not be what is there."""
+    table = person.page.get_by_role("img", name="The table now, from above")
+    return "grayscale(1)" in table.evaluate("table => getComputedStyle(table).filter")
+
+
 def test_what_was_proposed_before_the_table_changed_cannot_be_approved_and_the_page_says_so(
     browser: Browser, start, operator: Operator, decided, tmp_path: pathlib.Path
 ) -> None:
@@ -340,6 +437,7 @@ def test_what_was_proposed_before_the_table_changed_cannot_be_approved_and_the_p
     ada.cannot("Approve")
     expect(ada.page.get_by_role("status").filter(has_text="The proposal is stale: the table has changed about (")).to_be_visible()
     expect(ada.page.get_by_role("status").filter(has_text="Wait for the new proposal.")).to_be_visible()
+    assert is_greyed(ada)
     ada.page.keyboard.press("a")
     # Nor does the console take it from a program of the same operator.
     session = ada.page.evaluate("sessionStorage.getItem('session')")
@@ -352,6 +450,7 @@ def test_what_was_proposed_before_the_table_changed_cannot_be_approved_and_the_p
     os.kill(policy, signal.SIGCONT)
     renewed = operator.next("pick_place", accept=lambda newer: newer.id != proposal.id)
     ada.can("Approve")
+    assert not is_greyed(ada)
     ada.button("Approve").click()
     ada.reads("did it succeed")
     assert [(one.proposal_id, one.decision) for one in decided()] == [(renewed.id, StepConfirmation.APPROVE)]
@@ -419,6 +518,66 @@ def test_a_motion_stops_when_the_deciding_page_is_closed_and_the_run_goes_on_whe
     bob.close()
 
 
+def renderers(browser: Browser) -> set[int]:
+    """Process ids of a browser's pages."""
+    session = browser.new_browser_cdp_session()
+    found = {one["id"] for one in session.send("SystemInfo.getProcessInfo")["processInfo"] if one["type"] == "renderer"}
+    session.detach()
+    return found
+
+
+def sleeps(_: Person, processes: set[int]) -> None:
+    """The page's processes stand still, as on a machine that goes to sleep."""
+    for process in processes:
+        os.kill(process, signal.SIGSTOP)
+
+
+def is_hidden(person: Person, _: set[int]) -> None:
+    """The page says that another tab is in front of it."""
+    hide = "Object.defineProperty(document, 'visibilityState', { value: 'hidden' })"
+    person.page.evaluate(f"{hide}; document.dispatchEvent(new Event('visibilitychange'))")
+
+
+def loses_its_link(person: Person, _: set[int]) -> None:
+    """The browser's network is gone."""
+    person.context.set_offline(True)
+
+
+@pytest.mark.parametrize("way", [sleeps, is_hidden, loses_its_link])
+def test_a_motion_stops_when_the_deciding_page_is_there_no_more(browser: Browser, start, operator: Operator, way) -> None:
+    _, address = launch_web(start, 10024, "--require-presence")
+    # Her pages have processes of their own.
+    hers = launched(browser.browser_type)
+    ada = Person(hers, address, "Ada")
+    bob = Person(browser, address, "Bob")
+    ada.takes_control()
+    ada.can("Approve")
+    slow_down(operator, 0.5)
+    results = operator.count("step_result")
+    ada.button("Approve").click()
+    bob.reads("the arm moves")
+    gone_s = time.monotonic()
+    processes = renderers(hers)
+    way(ada, processes)
+    try:
+        stopped = operator.next("step_result", results)
+    finally:
+        for process in processes:
+            os.kill(process, signal.SIGCONT)
+    assert stopped.outcome == StepResult.STOPPED, stopped
+    # A second without a sign, and what the arm needs to come to rest.
+    assert time.monotonic() - gone_s < 3.0
+    bob.reads("stopped")
+    hers.close()
+    bob.close()
+
+
+def lesson_settings(person: Person) -> dict[str, Any]:
+    """Presets and ranges of heights and speeds, as the page was given them."""
+    ask = "fetch('/api/v1/lesson/settings', { headers: { Authorization: `Bearer ${sessionStorage.getItem('token')}` } })"
+    return person.page.evaluate(f"{ask}.then(answer => answer.json())")
+
+
 def test_a_task_that_no_module_programs_is_taught_by_clicks_and_the_shipped_policy_repeats_it_from_another_start(
     browser: Browser, start, operator: Operator, tmp_path: pathlib.Path
 ) -> None:
@@ -427,8 +586,20 @@ def test_a_task_that_no_module_programs_is_taught_by_clicks_and_the_shipped_poli
     ada = Person(browser, address_of(launch, until), "Ada")
     ada.takes_control()
     operator.next("heightmap")
+    operator.until(operator.executor_is_ready, "executor that has checked its driver", 60.0)
     ada.button("Teach a new task").click()
     ada.reads("Teaching a new task")
+    # What is not as it should be is no step, and is tried again.
+    teaching.choose(ada, operator, 0)
+    results = operator.count("step_result")
+    ada.button("Show the motion").click()
+    teaching.carry_out(ada)
+    teaching.seen_since(operator, operator.next("step_result", results).header.stamp)
+    ada.button("Not as it should be: try again").click()
+    ada.sees("Lesson, 0 steps so far. Click what to pick")
+    ada.button("End the lesson").click()
+    teaching.reset(operator, 10000)
+    ada.button("Teach a new task").click()
     ada.finds_no_barrier()
     teaching.show(ada, operator, 0)
     # The step is taken back, and shown once more.
@@ -443,6 +614,8 @@ def test_a_task_that_no_module_programs_is_taught_by_clicks_and_the_shipped_poli
     ada.can("Carry it out")
     ada.button("Change it").click()
     ada.sees("Click what to pick, then where to place it, and drag the hand")
+    # A preset sets all heights and speeds; a slider changes one, within its range.
+    ada.page.get_by_role("combobox", name="Motion").select_option("low and slow, for soft objects and chains")
     ada.page.get_by_text("Heights and speeds").click()
     carry = ada.page.get_by_role("slider", name="Speed while it carries")
     carry.focus()
@@ -451,7 +624,12 @@ def test_a_task_that_no_module_programs_is_taught_by_clicks_and_the_shipped_poli
         ada.page.keyboard.press("ArrowRight")
     ada.finds_no_barrier()
     teaching.carry_out_and_keep(ada, operator, 0)
-    assert round(operator.newest("pick_place").settings.carry_m_s, 3) == 0.3
+    settings, offered = operator.newest("pick_place").settings, lesson_settings(ada)
+    assert round(settings.carry_m_s, 3) == 0.3
+    assert offered["ranges"]["carry_m_s"][0] == 0.01
+    for name, value in offered["presets"]["gentle"].items():
+        assert name == "carry_m_s" or abs(getattr(settings, name) - value) < 0.01, name
+    ada.page.get_by_role("combobox", name="Motion").select_option("high and fast, for rigid objects")
     teaching.show_by_keyboard(ada, operator, 1)
     teaching.show(ada, operator, 2)
     ada.sees("Lesson, 3 steps so far.")
@@ -467,6 +645,9 @@ def test_a_task_that_no_module_programs_is_taught_by_clicks_and_the_shipped_poli
     ada.button("End the lesson").click()
 
     teaching.reset(operator, START)
+    for picture in ("start", "end"):
+        expect(ada.page.get_by_role("img", name=f"{teaching.NAME}, {picture}")).to_be_visible()
+    expect(ada.page.get_by_text(re.compile(rf"{teaching.NAME}: 3 steps, \d"))).to_be_visible()
     went = teaching.repeat(ada, operator)
     assert went.done, went
     ada.sees("1 of 1 run completed with any_start")
@@ -481,9 +662,17 @@ def test_a_task_that_no_module_programs_is_taught_by_clicks_and_the_shipped_poli
     assert len(kept) == 1
 
     # A policy learns from the one task and the correction, is compared on the other task, and is used while the graph is at work.
-    ada.page.get_by_role("combobox", name=f"1 correction of {teaching.NAME[:12]}").select_option("learn from")
-    ada.page.get_by_role("combobox", name=teaching.NAME).select_option("learn from")
+    ada.page.get_by_role("combobox", name=f"1 correction of {teaching.NAME}").select_option("learn from")
+    ada.page.get_by_role("combobox", name=teaching.NAME, exact=True).select_option("learn from")
     ada.page.get_by_role("combobox", name="held_back").select_option("hold out")
+    # One that takes too long is cancelled.
+    ada.page.get_by_label("Name of the policy").fill("long")
+    ada.page.get_by_role("spinbutton", name="Steps").fill("100000")
+    ada.button("Train").click()
+    ada.sees("long is being trained: step 0 of 100000.")
+    expect(ada.page.get_by_role("progressbar", name="Progress of the training")).to_be_visible()
+    ada.button("Cancel the training").click()
+    ada.sees("The training of long was cancelled.")
     ada.page.get_by_label("Name of the policy").fill("taught")
     ada.page.get_by_role("spinbutton", name="Steps").fill(str(TRAINING_STEPS))
     ada.button("Train").click()
@@ -510,6 +699,13 @@ def test_a_task_that_no_module_programs_is_taught_by_clicks_and_the_shipped_poli
     proposals = operator.count("pick_place")
     ada.button(f"Repeat {teaching.NAME}").click()
     operator.next("pick_place", proposals, lambda proposal: proposal.checkpoint == "taught")
+    # And back with one click.
+    ada.button("Go back to any_start").click()
+    ada.sees("The policy uses any_start.")
+    ada.can("Reject")
+    proposals = operator.count("pick_place")
+    ada.button("Reject").click()
+    operator.next("pick_place", proposals, lambda proposal: proposal.checkpoint == "any_start")
     ada.close()
 
 

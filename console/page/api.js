@@ -96,15 +96,16 @@ export class Api {
     const header = (name) => Number(response.headers.get(name));
     const [rows, width] = [header("x-rows"), header("x-cols")];
     const [rgb, cols] = [new Uint8Array(await response.arrayBuffer()), width / 2];
+    const number = header("x-number");
     const half = (side) => {
       const colors = new Uint8Array(3 * rows * cols);
       for (let row = 0; row < rows; row++) {
         const start = 3 * (row * width + side * cols);
         colors.set(rgb.subarray(start, start + 3 * cols), 3 * row * cols);
       }
-      return { rows, cols, rgb: colors, height_m: new Float32Array(rows * cols) };
+      return { key: `${number} ${side}`, rows, cols, rgb: colors, height_m: new Float32Array(rows * cols) };
     };
-    return { number: header("x-number"), pick_scores: half(0), place_scores: half(1) };
+    return { number, pick_scores: half(0), place_scores: half(1) };
   }
 
   /** Colours and heights of a heightmap, and its number. */

@@ -3,6 +3,12 @@
 import { make, objectAt } from "./view.js";
 
 const PERIOD_MS = 700;
+/** Score maps are drawn in blocks of so many cells along each side. */
+const BLOCK = 2;
+/** How bright what no score changes is in a score map. */
+const DIMMED = 0.4;
+/** A block has a score worth seeing where one of red, green and blue differs from the dimmed heightmap by more. */
+const SCORED = 40;
 
 /** World position to pixel, through the lens (plumb_bob); nothing behind the camera. */
 function project({ pose, fx_px, fy_px, cx_px, cy_px, distortion: [k1, k2, p1, p2, k3] }, point) {
@@ -61,6 +67,28 @@ function drawOn(context, camera, map, picture, { pick, place }) {
   line([arm(0, 0), arm(0.05 * cos, 0.05 * sin)], "#5cd6c0");
 }
 
+/** Score maps lie over the heightmap's surface. */
+function drawScores(context, camera, map, picture, { rgb }) {
+  const size_m = BLOCK * map.pixel_size_m;
+  context.globalAlpha = 0.75;
+  for (let row = 0; row + BLOCK <= map.rows; row += BLOCK) {
+    for (let col = 0; col + BLOCK <= map.cols; col += BLOCK) {
+      const cell = row * map.cols + col;
+      const [r, g, b] = rgb.subarray(3 * cell, 3 * cell + 3);
+      const change = (value, part) => Math.abs(value - DIMMED * picture.rgb[3 * cell + part]);
+      if (Math.max(change(r, 0), change(g, 1), change(b, 2)) < SCORED) continue;
+      const [x, y, z] = [map.origin_x_m + col * map.pixel_size_m, map.origin_y_m + row * map.pixel_size_m, picture.height_m[cell]];
+      const corners = [[x, y, z], [x + size_m, y, z], [x + size_m, y + size_m, z], [x, y + size_m, z]].map((corner) => project(camera, corner));
+      if (corners.includes(null)) continue;
+      context.fillStyle = `rgb(${r},${g},${b})`;
+      context.beginPath();
+      corners.forEach(([u, v], index) => (index ? context.lineTo(u, v) : context.moveTo(u, v)));
+      context.fill();
+    }
+  }
+  context.globalAlpha = 1;
+}
+
 /** The camera views in a `details` element. */
 export class CameraViews {
   #api;
@@ -68,6 +96,7 @@ export class CameraViews {
   #list;
   #views = new Map();
   #proposal = null;
+  #scores = null;
   #shown = "";
   #timer = 0;
 
@@ -76,11 +105,15 @@ export class CameraViews {
     details.addEventListener("toggle", () => this.#poll());
   }
 
-  /** What is drawn on the images: the heightmap, its picture, and pick and place; nothing without a proposal. */
-  show(map, picture, proposal) {
-    const shown = JSON.stringify([picture?.number, proposal?.pick, proposal?.place]);
+  /**
+   * What is drawn on the images: the heightmap, its picture, and pick and place; nothing without a proposal. And a score map, where
+   * there is one.
+   */
+  show(map, picture, proposal, scores) {
+    const shown = JSON.stringify([picture?.number, proposal?.pick, proposal?.place, scores?.key]);
     if (shown === this.#shown) return;
     this.#shown = shown;
+    this.#scores = map && picture && scores?.rows === map.rows && scores.cols === map.cols ? { map, picture, scores } : null;
     this.#proposal = map && picture && proposal?.pick && proposal.place ? { map, picture, proposal } : null;
     for (const view of this.#views.values()) this.#draw(view);
   }
@@ -115,5 +148,7 @@ export class CameraViews {
     const context = canvas.getContext("2d");
     context.putImageData(image, 0, 0);
     if (this.#proposal && camera.pose) drawOn(context, camera, this.#proposal.map, this.#proposal.picture, this.#proposal.proposal);
+    // Over the marks: the highest scores lie where these are.
+    if (this.#scores && camera.pose) drawScores(context, camera, this.#scores.map, this.#scores.picture, this.#scores.scores);
   }
 }

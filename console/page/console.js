@@ -3,7 +3,7 @@
 import { Api } from "./api.js";
 import { Arm } from "./arm.js";
 import { CameraViews } from "./cameras.js";
-import { board, draw, drawObject, drawProposal, handTip, make, middleOfObject, pointed } from "./view.js";
+import { board, draw, drawAxes, drawObject, drawProposal, handTip, make, middleOfObject, pointed } from "./view.js";
 
 const ROBOT_MODES = {
   "-1": "no controller", 0: "disconnected", 1: "confirm safety", 2: "booting", 3: "power off", 4: "power on", 5: "idle",
@@ -17,8 +17,8 @@ const SAFETY_MODES = {
 const LEGENDS = {
   color: "Yellow ring: pick. Green cross: place; its hand shows the turn.",
   height: "Dark blue: the table. Yellow: the highest.",
-  pick_scores: "Where the policy would pick: the brighter, the rather.",
-  place_scores: "Where the policy would place: the brighter, the rather.",
+  pick_scores: "Where the policy would pick: the brighter, the higher its score.",
+  place_scores: "Where the policy would place: the brighter, the higher its score.",
   difference: "Orange: something is to come here. Blue: something is to go. Pink: the colour differs.",
 };
 const DECISIONS = ["approve", "reject", "advance", "retry", "stop"];
@@ -77,6 +77,11 @@ function need(which, number, load = () => api.heightmap(which)) {
   return null;
 }
 
+/** The first stream that has to be fresh and is not. */
+function silent() {
+  return state?.streams.find((stream) => stream.required && stream.stale)?.name;
+}
+
 /** Why a decision cannot be made here and now; nothing where it can. */
 function obstacle(action) {
   if (link !== "up") return "The link to the console is lost: what you see is old.";
@@ -90,9 +95,10 @@ function obstacle(action) {
   }
   if (action === "go-home") return state.motion?.proposal_id === state.home?.proposal_id ? undefined : "The way home is being planned.";
   if (state.home && !state.home.approved && action === "approve") return "The way home is shown: decide on it first.";
-  if (state.lesson && action !== "home") return "A lesson is being given. Save it or end it first.";
+  if (state.lesson && !["home", "execute"].includes(action)) return "A lesson is being given. Save it or end it first.";
   if (action === "teach") return state.phase === "moving" ? "The arm is moving." : undefined;
   if (action === "correct") return ["proposed", "awaiting_proposal"].includes(state.phase) ? undefined : "Nothing can be proposed now.";
+  if (action === "execute" && silent()) return `${silent()} is stale: what you see may not be what is there.`;
   if (action === "home") return state.phase === "moving" || state.lesson?.phase === "moving" ? "The arm is moving." : undefined;
   if (action === "continue") return state.phase === "stopped" ? undefined : "The run is not stopped.";
   const refused = state.refused[action];
@@ -233,7 +239,9 @@ async function ask(what) {
 }
 
 // A lesson: pick and place are chosen as in a correction, the planned motion is shown, and carried out when the person says so.
-$("execute").addEventListener("click", () => ask(() => api.post("lesson/execute")));
+$("execute").addEventListener("click", () => {
+  if (!obstacle("execute")) ask(() => api.post("lesson/execute"));
+});
 $("change").addEventListener("click", () => ask(() => api.post("lesson/change")));
 $("leave-home").addEventListener("click", () => ask(() => api.post("decisions", { proposal_id: state.home.proposal_id, decision: "reject" })));
 $("reached").addEventListener("click", () => ask(() => api.post("lesson/judge", { reached: true })));
@@ -272,7 +280,7 @@ function renderLesson() {
   form.elements.preset.parentElement.hidden = $("settings").hidden = !lesson;
   $("cancel-correction").hidden = Boolean(lesson);
   setText($("send-correction"), lesson ? "Show the motion" : "Propose this");
-  setText($("correction-help"), lesson ? "Click what to pick, then where to place it, and drag the hand to turn it; or type [mm, degrees]." : "Drag pick, place and the hand of the turn on the picture, or type [mm, degrees].");
+  setText($("correction-help"), lesson ? "Click what to pick, then where to place it, and drag the hand to turn it; or type." : "Drag pick, place and the hand of the turn on the picture, or type.");
   if (!lesson) {
     if (lessonShown) {
       lessonShown = "";
@@ -329,7 +337,7 @@ async function loadLibrary() {
       const container = make("div", { className: "board" });
       const { canvas } = board(container, `${entry.name}, ${label}`);
       api.heightmap(`demonstrations/${entry.name}/${step}`).then((picture) => draw(canvas, picture, "color")).catch(() => {});
-      pictures.append(container);
+      pictures.append(make("figure", {}, make("figcaption", { className: "small", textContent: label === "start" ? "Start" : "End" }), container));
     }
     const words = `${entry.name}: ${entry.step_count} ${entry.step_count === 1 ? "step" : "steps"}, ${saved}`;
     return make("li", {}, make("p", { textContent: words }), make("p", { className: "small", textContent: success(entry) }), pictures, repeat);
@@ -339,7 +347,8 @@ async function loadLibrary() {
   [...$("library").querySelectorAll("button")].find((button) => button.textContent === focused)?.focus();
   corrections = new Map();
   for (const { name } of listed.corrections) {
-    const words = `corrections of ${name.split("-")[0]}`;
+    // PROBLEM-STEP-ID, where the problem's name may have a - too.
+    const words = `corrections of ${name.split("-").slice(0, -2).join("-")}`;
     corrections.set(words, [...(corrections.get(words) ?? []), name]);
   }
   // What is chosen stays so when the list is read again.
@@ -358,7 +367,9 @@ async function loadLibrary() {
 
 async function loadCheckpoints() {
   const list = await api.get("checkpoints").catch(() => []);
+  const chosen = $("policy").value || policyKnown;
   $("policy").replaceChildren(...list.map(({ name }) => make("option", { value: name, textContent: name })));
+  if (list.some(({ name }) => name === chosen)) $("policy").value = chosen;
   $("policy-label").hidden = $("use-policy").hidden = list.length === 0;
 }
 
@@ -438,18 +449,27 @@ function renderTraining() {
   trainingShown = phase;
 }
 
+let policyKnown = "";
+
 function renderPolicy() {
   const name = (path) => path.split("/").at(-1).replace(/\.safetensors$/, "");
   const { policy, proposal } = state;
   $("policy-back").hidden = !policy;
   if (policy) setText($("policy-back"), `Go back to ${name(policy.previous)}`);
-  const now = policy ? name(policy.checkpoint) : proposal?.checkpoint;
+  // A person's proposal has no checkpoint.
+  const now = policy ? name(policy.checkpoint) : proposal?.checkpoint || policyKnown;
+  if (now !== policyKnown) {
+    policyKnown = now;
+    $("policy").value = now;
+  }
   if (isOperator() || !$("policy-note").textContent) setText($("policy-note"), now ? `The policy uses ${now}.` : "");
 }
 
 /** Drags what is nearest to the pointer: pick or place. */
 boards.now.svg.addEventListener("pointerdown", (event) => {
   if (!correction || form.hidden) return;
+  // A field that has the focus is not written to while somebody types.
+  if (form.contains(document.activeElement)) document.activeElement.blur();
   const { svg } = boards.now;
   const [x_m, y_m] = pointed(state.heightmap, svg, event);
   const distance = (pose) => Math.hypot(pose.x_m - x_m, pose.y_m - y_m);
@@ -527,7 +547,7 @@ function renderRole() {
 }
 
 function renderButtons() {
-  for (const action of [...DECISIONS, "correct", "home", "go-home", "continue", "teach"]) {
+  for (const action of [...DECISIONS, "correct", "home", "go-home", "continue", "teach", "execute"]) {
     $(action).setAttribute("aria-disabled", String(Boolean(obstacle(action))));
   }
   const stopped = state?.phase === "stopped";
@@ -546,9 +566,9 @@ function renderButtons() {
   $("way-home").hidden = !home;
   $("go-home").hidden = $("leave-home").hidden = !home || home.approved;
   if (home) setText($("way-home-state"), home.approved ? "The arm goes home. Watch it; stop if anything is wrong." : "This is the way home: it is played below. Nothing moves before you approve it.");
-  const main = judging ? "advance" : stopped ? "continue" : "approve";
-  setText($("why"), answer || (lesson && isOperator() ? "" : obstacle(main)) || "");
-  const stale = link !== "up" || (state?.phase === "proposed" && state.stale);
+  const main = lesson ? "execute" : judging ? "advance" : stopped ? "continue" : "approve";
+  setText($("why"), answer || (lesson && isOperator() && state.lesson.phase !== "previewing" ? "" : obstacle(main)) || "");
+  const stale = link !== "up" || Boolean(silent()) || (state?.phase === "proposed" && state.stale);
   document.body.classList.toggle("stale", stale);
 }
 
@@ -566,7 +586,14 @@ function renderPictures() {
   const goalMap = state.goal?.heightmap;
   const goal = goalMap && (need("goal", goalMap.number) ?? pictures.get("goal"));
   const scored = mode.endsWith("_scores");
+  $("boards").classList.toggle("scored", scored);
   const scores = scored && state.scores ? need("scores", state.scores, () => api.scores()) : null;
+  for (const [{ axes }, at] of [[boards.now, map], [boards.goal, goalMap]]) {
+    const lies = at && [at.rows, at.cols, at.pixel_size_m, at.origin_x_m, at.origin_y_m].join(" ");
+    if (!at || axes.dataset.drawn === lies) continue;
+    axes.dataset.drawn = lies;
+    drawAxes(axes, at);
+  }
   if (scored && !state.scores) setText($("legend"), "There are no scores of the present proposal.");
   const drawn = `${mode} ${present?.number} ${mode === "difference" ? goal?.number : ""} ${scores?.number}`;
   if ($("boards").dataset.drawn !== drawn) {
@@ -592,15 +619,15 @@ function renderPictures() {
     svg.dataset.drawn = overlay;
     drawProposal(svg, at, present, proposal, name === "now" && Boolean(choosing));
   }
-  cameras.show(map, present, proposal);
-  const metres = (pose) => `x ${pose.x_m.toFixed(3)} m, y ${pose.y_m.toFixed(3)} m`;
+  cameras.show(map, present, proposal, scores?.[mode]);
+  const lies = ({ x_m, y_m }) => `x ${(1000 * x_m).toFixed(0)} mm, y ${(1000 * y_m).toFixed(0)} mm`;
   setText($("proposal"), choosing
     ? correction.pick && correction.place
-      ? `Your pick at ${metres(proposal.pick)}. Your place at ${metres(proposal.place)}, turned by ${Math.round(turnOf(proposal))}°.`
+      ? `Your pick at ${lies(proposal.pick)}. Your place at ${lies(proposal.place)}, turned by ${Math.round(turnOf(proposal))}°.`
       : correction.pick ? "Now click where to place it." : "Click what to pick."
-    : shownStep ? `Pick at ${metres(proposal.pick)}. Place at ${metres(proposal.place)}, turned by ${Math.round(turnOf(proposal))}°.`
+    : shownStep ? `Pick at ${lies(proposal.pick)}. Place at ${lies(proposal.place)}, turned by ${Math.round(turnOf(proposal))}°.`
     : proposal
-    ? `Pick at ${metres(proposal.pick)}. Place at ${metres(proposal.place)}, turned by ${Math.round(turnOf(proposal))}°.${whose(proposal)}`
+    ? `Pick at ${lies(proposal.pick)}. Place at ${lies(proposal.place)}, turned by ${Math.round(turnOf(proposal))}°.${whose(proposal)}`
     : "");
 }
 
@@ -652,7 +679,7 @@ function renderMotion() {
   if (playable) $("time").max = motion.times_s.at(-1);
   setText($("motion-note"), playable ? `The planned motion takes ${motion.times_s.at(-1).toFixed(1)} s. Green: with suction.`
     : motion?.reason ? `The motion cannot be planned: ${motion.reason}`
-    : arm.ready ? "The robot as it is now." : "Nobody has described the robot.");
+    : arm.ready ? "The robot as it is now." : "The robot's description has not arrived (topic robot_description).");
   const [map, present] = [state.heightmap, pictures.get("present")];
   const table = `${map?.number} ${present?.number}`;
   if (present && $("arm").dataset.table !== table) {
@@ -670,16 +697,16 @@ function whose({ author, checkpoint, pick_score, place_score, success_probabilit
   if (!checkpoint && author) return ` Made by ${author}.`;
   const by = author ? ` Made by ${author}${checkpoint ? ` with ${checkpoint}` : ""}.` : "";
   const success = success_probability == null ? "" : ` It expects the step to succeed with ${percent(success_probability)}.`;
-  return `${by} The policy gives the pick ${percent(pick_score)} and the place ${percent(place_score)}.${success}`;
+  return `${by} Its scores: pick ${percent(pick_score)}, place ${percent(place_score)}.${success}`;
 }
 
-/** A small picture in a list. */
-function thumbnail(which, number, label) {
+/** A small picture in a list, with its caption. */
+function thumbnail(which, number, label, caption) {
   const container = make("div", { className: "board" });
   const picture = number == null ? null : need(which, number);
   if (picture) draw(board(container, label).canvas, picture, "color");
   else container.append(make("span", { className: "unknown", textContent: "not seen yet" }));
-  return container;
+  return make("figure", {}, make("figcaption", { className: "small", textContent: caption }), container);
 }
 
 /** Makes a list anew where it shows something else than before. */
@@ -697,7 +724,7 @@ function renderStrip() {
   const ready = (step) => number(step) != null && pictures.get(`goal-${step}`)?.number === number(step);
   const now = (step) => step === goal.step && !goal.complete;
   renderList($("strip"), steps, (step) => [number(step), ready(step), now(step)], (step) => {
-    const item = make("li", {}, thumbnail(`goal-${step}`, number(step), `Goal of step ${step}`), `Step ${step}${now(step) ? " (now)" : ""}`);
+    const item = make("li", {}, thumbnail(`goal-${step}`, number(step), `Goal of step ${step}`, `Step ${step}${now(step) ? " (now)" : ""}`));
     if (now(step)) item.setAttribute("aria-current", "step");
     return item;
   });
@@ -711,8 +738,8 @@ function renderSteps() {
     const who = decided ? `: ${step.decided_by} said it ${decided}` : "";
     const text = `Step ${step.proposal.step}, attempt ${step.proposal.attempt + 1}: ${step.outcome}, ${step.duration_s.toFixed(1)} s${who}`;
     return make("li", {}, make("p", { textContent: text }), make("div", { className: "pair" },
-      thumbnail(`before-${step.number}`, step.before, `Before step ${step.proposal.step}`),
-      thumbnail(`after-${step.number}`, step.after, `After step ${step.proposal.step}`)));
+      thumbnail(`before-${step.number}`, step.before, `Before step ${step.proposal.step}`, "Before"),
+      thumbnail(`after-${step.number}`, step.after, `After step ${step.proposal.step}`, "After")));
   });
 }
 
@@ -752,6 +779,7 @@ function renderRobot() {
 }
 
 function renderMessages() {
+  $("no-messages").hidden = state.notices.length > 0;
   renderList($("messages"), state.notices.toReversed(), (notice) => notice.number, (notice) => {
     const kind = { refusal: "Refused. ", fault: "Fault. ", note: "" }[notice.kind];
     return make("li", { className: notice.kind }, `${kind}${notice.reason} ${notice.advice}`);

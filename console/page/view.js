@@ -198,12 +198,36 @@ export function drawProposal(svg, map, picture, proposal, handle = false) {
   label("Place", placeU, placeV);
 }
 
-/** A canvas with a drawing over it. */
+/** Draws where the world's axes lie: a mark each 100 mm along the edges. */
+export function drawAxes(svg, map) {
+  svg.setAttribute("viewBox", `0 0 ${map.rows} ${map.cols}`);
+  svg.replaceChildren();
+  const marks = (begin_m, cells) => {
+    const [first, last] = [begin_m, begin_m + cells * map.pixel_size_m].map((edge_m) => 10 * edge_m);
+    // Not at the very edges, where a number would be cut off.
+    const inside = (mark) => mark > first + 0.3 && mark < last - 0.3;
+    return Array.from({ length: Math.floor(last) - Math.ceil(first) + 1 }, (_, index) => Math.ceil(first) + index).filter(inside);
+  };
+  for (const [index, mark] of marks(map.origin_x_m, map.cols).entries()) {
+    const [, v] = toPicture(map, mark / 10, map.origin_y_m);
+    element("line", { x1: 0, x2: 4, y1: v, y2: v }, svg);
+    element("text", { x: 6, y: v + 3 }, svg, index ? `${100 * mark}` : `x ${100 * mark} mm`);
+  }
+  for (const [index, mark] of marks(map.origin_y_m, map.rows).entries()) {
+    const [u] = toPicture(map, map.origin_x_m, mark / 10);
+    element("line", { x1: u, x2: u, y1: map.cols, y2: map.cols - 4 }, svg);
+    // Not where the numbers of the other axis stand.
+    if (mark % 2 === 0 && u > 45) element("text", { x: u, y: map.cols - 6, "text-anchor": "middle" }, svg, index > 1 ? `${100 * mark}` : `y ${100 * mark} mm`);
+  }
+}
+
+/** A canvas with a drawing over it; `axes` is where axes may be drawn. */
 export function board(container, label) {
   const canvas = document.createElement("canvas");
   canvas.setAttribute("role", "img");
   canvas.setAttribute("aria-label", label);
   const svg = element("svg", { "aria-hidden": "true", preserveAspectRatio: "none" });
-  container.replaceChildren(canvas, svg);
-  return { canvas, svg };
+  const axes = element("svg", { "aria-hidden": "true", preserveAspectRatio: "none", class: "axes" });
+  container.replaceChildren(canvas, axes, svg);
+  return { canvas, svg, axes };
 }

@@ -16,8 +16,8 @@ use crate::run::{Pose, View};
 const MOST_STEPS: usize = 100;
 /// Most times that a motion is proposed again because another proposal has taken its place.
 const MOST_RENEWALS: u32 = 8;
-/// Longest name of a demonstration [characters].
-const LONGEST_NAME: usize = 40;
+/// Longest name that a person gives [characters].
+pub(crate) const LONGEST_NAME: usize = 40;
 
 /// How far a lesson is.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
@@ -380,17 +380,22 @@ impl Lesson {
     }
 }
 
-/// A name of a demonstration is that of its folder.
+/// Checks the name that a person gives to a demonstration or a policy: it becomes that of a folder or file.
 ///
 /// # Errors
-/// When it is none.
+/// When it cannot be one.
 pub fn check_name(name: &str) -> Result<(), Refusal> {
+    check_name_up_to(name, LONGEST_NAME)
+}
+
+/// As [`check_name`], for names of up to so many characters.
+pub(crate) fn check_name_up_to(name: &str, longest: usize) -> Result<(), Refusal> {
     let good = |character: char| character.is_ascii_alphanumeric() || "-_".contains(character);
-    if (1..=LONGEST_NAME).contains(&name.len()) && name.chars().all(good) {
+    if (1..=longest).contains(&name.len()) && name.chars().all(good) {
         return Ok(());
     }
     Err(Refusal::new(
-        format!("A demonstration's name has 1 to {LONGEST_NAME} letters, digits, - and _."),
+        format!("A demonstration's name has 1 to {longest} letters, digits, - and _."),
         "Type another name.",
     ))
 }

@@ -10,11 +10,13 @@ use heightmap::Heightmap;
 use serde::Serialize;
 
 use crate::history::{History, RunCount};
-use crate::lesson::check_name;
+use crate::lesson;
 use crate::refusal::Refusal;
 
 /// Most demonstrations that are listed.
 const MOST: usize = 1000;
+/// Longest name of a folder [characters]: that of a correction, which is a problem's name, the number of a step and that of a proposal.
+const LONGEST_NAME: usize = lesson::LONGEST_NAME + 28;
 
 /// A demonstration in the library.
 #[derive(Clone, Debug, PartialEq, Serialize)]
@@ -94,7 +96,7 @@ impl Library {
     /// # Errors
     /// When the name cannot be that of a demonstration.
     pub fn path(&self, name: &str) -> Result<PathBuf, Refusal> {
-        check_name(name)?;
+        check_folder_name(name)?;
         std::path::absolute(self.folder.join(name)).map_err(|error| {
             Refusal::new(
                 format!("{}: {error}.", self.folder.display()),
@@ -117,7 +119,7 @@ impl Library {
         for folder in folders.flatten().take(MOST) {
             let name = folder.file_name().to_string_lossy().into_owned();
             let changed = folder.metadata().and_then(|metadata| metadata.modified());
-            let (Ok(changed), Ok(())) = (changed, check_name(&name)) else {
+            let (Ok(changed), Ok(())) = (changed, check_folder_name(&name)) else {
                 continue;
             };
             let is_known = known.get(&name).is_some_and(|(at, _)| *at == changed);
@@ -179,6 +181,14 @@ impl Library {
             .write(&path)
             .map_err(|error| failed(error.to_string()))
     }
+}
+
+/// Checks that a name can be that of a demonstration's folder.
+///
+/// # Errors
+/// When it is none.
+pub fn check_folder_name(name: &str) -> Result<(), Refusal> {
+    lesson::check_name_up_to(name, LONGEST_NAME)
 }
 
 fn read_entry(path: &Path, name: &str, changed: SystemTime) -> Option<Entry> {

@@ -35,6 +35,8 @@ const SENT: usize = 64;
 pub enum Command {
     /// Publish this confirmation; the node stamps it.
     Confirm(Confirmation),
+    /// Publish at once whether the operator is present, before anything that they decide.
+    Presence,
     /// Publish this proposal of the operator's.
     Propose(Box<Proposal>),
     /// Have the executor propose the way home; for whom.
@@ -444,6 +446,12 @@ impl State {
             }
             None => self.heard_confirmation(confirmation, now),
         }
+    }
+
+    /// Whether the operator is present has changed. An executor that requires it has to hear so before their first decision.
+    pub fn presence_changed(&self) {
+        // An inactive console says nothing.
+        let _ = self.send(Command::Presence);
     }
 
     fn send(&self, command: Command) -> Result<(), Refusal> {

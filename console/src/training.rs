@@ -467,6 +467,27 @@ pub(crate) mod tests {
         }
     }
 
+    /// A held-out step of a comparison.
+    pub(crate) fn give_example(trainings: &Trainings) {
+        let pose = Pose {
+            x_m: 0.5,
+            y_m: 0.1,
+            yaw_rad: 0.2,
+        };
+        let action = Action {
+            pick: pose,
+            place: pose,
+        };
+        let example = Example {
+            demonstration: "blocks".into(),
+            step: 1,
+            shown: action,
+            new: action,
+            now: action,
+        };
+        *trainings.examples.lock().unwrap() = vec![example];
+    }
+
     use std::os::unix::fs::PermissionsExt as _;
     use std::path::Path;
     use std::time::Duration;

@@ -169,7 +169,7 @@ impl Shown<'_> {
         })
     }
 
-    /// FNV-1a of 64 bits over what makes the proposal what it is, and over a word that no policy's proposal has.
+    /// A hash of what makes the proposal what it is, and of a word that no policy's proposal has.
     fn id(&self, stamp: Duration) -> ProposalId {
         let poses = [self.pick, self.place].map(|pose| [pose.x_m, pose.y_m, pose.yaw_rad]);
         let words = [
@@ -180,11 +180,15 @@ impl Shown<'_> {
         .into_iter()
         .chain(poses.concat().into_iter().map(f64::to_bits))
         .flat_map(u64::to_le_bytes);
-        let bytes = b"operator".iter().copied().chain(words);
-        ProposalId(bytes.fold(0xcbf2_9ce4_8422_2325, |hash, byte| {
-            (hash ^ u64::from(byte)).wrapping_mul(0x0000_0100_0000_01b3)
-        }))
+        ProposalId(fnv1a(b"operator".iter().copied().chain(words)))
     }
+}
+
+/// FNV-1a of 64 bits.
+pub(super) fn fnv1a(bytes: impl Iterator<Item = u8>) -> u64 {
+    bytes.fold(0xcbf2_9ce4_8422_2325, |hash, byte| {
+        (hash ^ u64::from(byte)).wrapping_mul(0x0000_0100_0000_01b3)
+    })
 }
 
 fn no_picture() -> Refusal {

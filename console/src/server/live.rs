@@ -2,12 +2,13 @@
 
 use std::time::Duration;
 
-use axum::extract::State;
+use axum::extract;
 use axum::extract::ws::{CloseFrame, Message, Utf8Bytes, WebSocket, WebSocketUpgrade, close_code};
 use axum::response::Response;
 use serde::Deserialize;
 
 use super::Shared;
+use crate::state::State;
 
 /// Largest WebSocket message from a client [bytes].
 const LARGEST_MESSAGE: usize = 4 * 1024;
@@ -31,7 +32,10 @@ pub(super) enum Said {
     Present { visible: bool },
 }
 
-pub(super) async fn live(State(shared): State<Shared>, upgrade: WebSocketUpgrade) -> Response {
+pub(super) async fn live(
+    extract::State(shared): extract::State<Shared>,
+    upgrade: WebSocketUpgrade,
+) -> Response {
     upgrade
         .max_message_size(LARGEST_MESSAGE)
         .max_frame_size(LARGEST_MESSAGE)
@@ -76,7 +80,8 @@ async fn follow(shared: Shared, mut socket: WebSocket) {
                 state.sessions.presence(now).map(|(_, present)| present)
             });
             if before != after {
-                shared.page.console.change(|_, _| ());
+                let tell = |state: &mut State, _| state.presence_changed();
+                shared.page.console.change(tell);
             }
         }
     };

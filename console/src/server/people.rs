@@ -64,6 +64,7 @@ pub(super) async fn change_operator(by: By, Body(change): Body<ChangeOperator>) 
             ChangeOperator::Take { from } => state.sessions.take(by.viewer, from),
             ChangeOperator::HandOver { to } => state.sessions.hand_over(by.viewer, to),
         }?;
+        state.presence_changed();
         let operator = state.sessions.operator();
         Ok::<_, Refusal>(operator.map(|id| state.sessions.name(id).to_owned()))
     })?;

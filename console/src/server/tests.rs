@@ -7,11 +7,31 @@ use axum::extract::Request;
 use axum::http::HeaderMap;
 use axum::http::Method;
 use axum::http::header::CONTENT_SECURITY_POLICY;
-use heightmap::ChangeRules;
+use heightmap::{ChangeRules, Intrinsics};
+use nalgebra::Isometry3;
+use serde_json::{Value, json};
+use std::path::Path;
 use tower::ServiceExt as _;
 
 const TOKEN: &str = "0123456789abcdef";
 const HOST_NAME: &str = "127.0.0.1:8750";
+
+/// A page whose files lie in a folder.
+fn page(console: Console, folder: &Path) -> Page {
+    let trainings = Trainings::new(
+        "no/such/program".into(),
+        "recipe".into(),
+        folder.join("training"),
+        "checkpoint".into(),
+    );
+    Page {
+        console: Arc::new(console),
+        libraries: Arc::new(Libraries::new(&folder.join("library"))),
+        checkpoints: Arc::new(Checkpoints::new([folder.into(), "no/such/folder".into()])),
+        trainings: Arc::new(trainings),
+        cameras: Arc::new(Cameras::new(&["front".into()], "world")),
+    }
+}
 
 struct Client {
     router: Router,
@@ -31,6 +51,7 @@ impl Answer {
 }
 
 impl Client {
+    /// Of a console that has heard nothing.
     fn new() -> Self {
         let watch = Watch {
             nodes: Vec::new(),
@@ -39,20 +60,11 @@ impl Client {
             changes: ChangeRules::default(),
         };
         let sessions = Sessions::new(4, Duration::from_secs(60));
-        let console = Arc::new(Console::new(Run::new(watch), sessions));
-        let trainings = Trainings::new(
-            "no/such/program".into(),
-            "recipe".into(),
-            "no/such/folder".into(),
-            "checkpoint".into(),
-        );
-        let page = Page {
-            console,
-            libraries: Arc::new(Libraries::new(std::path::Path::new("no/such/folder"))),
-            checkpoints: Arc::new(Checkpoints::new(["no/such".into(), "folder".into()])),
-            trainings: Arc::new(trainings),
-            cameras: Arc::new(Cameras::new(&["front".into()], "world")),
-        };
+        let console = Console::new(Run::new(watch), sessions);
+        Self::of(page(console, Path::new("no/such/folder")))
+    }
+
+    fn of(page: Page) -> Self {
         let address = HOST_NAME.parse().unwrap();
         let access = Access::new(TOKEN.into(), address, &["cell.example".into()], false);
         let end = CancellationToken::new();
@@ -229,6 +241,20 @@ async fn who_watches_decides_nothing_and_who_has_given_control_away_neither() {
         .json();
     assert_eq!(state["operator"], bob);
     assert!(!state.to_string().contains(&first), "keys are secret");
+}
+
+#[tokio::test]
+async fn that_somebody_decides_now_is_said_before_their_first_decision() {
+    let (console, ..) = crate::state::tests::proposed();
+    let mut commands = console.connect();
+    let client = Client::of(page(console, Path::new("no/such/folder")));
+    let hand_over = r#"{"action": "hand_over", "to": null}"#;
+    let take = r#"{"action": "take", "from": null}"#;
+    for change in [hand_over, take] {
+        let answer = client.post("/api/v1/operator", "key", change).await;
+        assert_eq!(answer.status, StatusCode::NO_CONTENT, "{}", answer.text);
+        assert_eq!(commands.try_recv(), Ok(crate::Command::Presence));
+    }
 }
 
 #[tokio::test]
@@ -437,24 +463,207 @@ fn the_description_tells_every_field_of_the_state() {
     assert_eq!(undescribed(&description, schema, &state, "state"), [""; 0]);
 }
 
+/// A page that has something of everything, in an empty folder.
+fn page_with_everything(folder: &Path) -> Page {
+    let page = page(crate::state::tests::with_everything(), folder);
+    let demonstration = crate::state::tests::demonstration("blocks");
+    let Libraries {
+        tasks,
+        corrections,
+        history,
+    } = &*page.libraries;
+    tasks.save("blocks", &demonstration).unwrap();
+    corrections
+        .save("blocks-1-0000000000000007", &demonstration)
+        .unwrap();
+    let began = crate::history::RunEvent::Began {
+        run: 7,
+        demonstration: "blocks".into(),
+        goals: "blocks/0".into(),
+        checkpoint: "one".into(),
+    };
+    history.add(began).unwrap();
+    std::fs::write(folder.join("one.safetensors"), "").unwrap();
+    crate::training::tests::give_example(&page.trainings);
+    let cameras = &page.cameras;
+    cameras.on_intrinsics("front", Intrinsics::RAVENS);
+    cameras.on_image("front", Duration::ZERO, "optical".into(), vec![]);
+    cameras
+        .on_transform("world", "optical", Isometry3::identity())
+        .unwrap();
+    page
+}
+
+/// What the description has of a path: the schema of the JSON that a method is answered with.
+fn schema_of_answer<'a>(description: &'a Value, path: &str, method: &str) -> &'a Value {
+    &description["paths"][path][method]["responses"]["200"]["content"]["application/json"]["schema"]
+}
+
 #[tokio::test]
 async fn answers_are_what_the_description_says() {
-    let description: serde_json::Value = serde_yaml_ng::from_str(DESCRIPTION).unwrap();
-    let client = Client::new();
-    for path in [
-        "/api/v1/state",
-        "/api/v1/cameras",
-        "/api/v1/checkpoints",
-        "/api/v1/demonstrations",
-        "/api/v1/lesson/settings",
-        "/api/v1/training/comparison",
-    ] {
+    let description: Value = serde_yaml_ng::from_str(DESCRIPTION).unwrap();
+    let folder = tempfile::tempdir().unwrap();
+    let client = Client::of(page_with_everything(folder.path()));
+    let mut compared = 0;
+    for path in description["paths"].as_object().unwrap().keys() {
+        let schema = schema_of_answer(&description, path, "get");
+        if schema.is_null() {
+            continue;
+        }
         let answer = client.ask(Method::GET, path, &[], "").await;
-        assert_eq!(answer.status, StatusCode::OK, "{path}");
-        let schema = &description["paths"][path]["get"]["responses"]["200"]["content"]["application/json"]
-            ["schema"];
-        assert!(schema.is_object(), "{path}");
-        let mistakes = undescribed(&description, schema, &answer.json(), path);
+        assert_eq!(answer.status, StatusCode::OK, "{path}: {}", answer.text);
+        // A list without anything would fit every description.
+        let answer = answer.json();
+        let is_empty = |value: &Value| value.as_array().is_some_and(Vec::is_empty);
+        let mut parts = answer
+            .as_object()
+            .into_iter()
+            .flat_map(|object| object.values());
+        let is_full = path == "/api/v1/state" || !is_empty(&answer) && !parts.any(is_empty);
+        assert!(is_full, "{path}: {answer}");
+        let mistakes = undescribed(&description, schema, &answer, path);
         assert_eq!(mistakes, [""; 0]);
+        compared += 1;
+    }
+    assert_eq!(compared, 7);
+}
+
+/// The schema that is meant where another one is named.
+fn meant<'a>(description: &'a Value, schema: &'a Value) -> &'a Value {
+    match schema["$ref"].as_str() {
+        Some(reference) => description
+            .pointer(reference.trim_start_matches('#'))
+            .unwrap(),
+        None => schema,
+    }
+}
+
+/// A value that a schema describes, with everything that may be in it.
+fn example(description: &Value, schema: &Value) -> Value {
+    let schema = meant(description, schema);
+    if let Some(value) = [&schema["const"], &schema["enum"][0]]
+        .into_iter()
+        .find(|value| !value.is_null())
+    {
+        return value.clone();
+    }
+    let kind = schema["type"][0].as_str().or(schema["type"].as_str());
+    match kind.unwrap() {
+        "string" => json!("7"),
+        "integer" => json!(1),
+        "number" => json!(0.5),
+        "boolean" => json!(true),
+        "array" => json!([example(description, &schema["items"])]),
+        "object" => {
+            let properties = schema["properties"].as_object().unwrap();
+            let filled = properties
+                .iter()
+                .map(|(name, schema)| (name.clone(), example(description, schema)));
+            Value::Object(filled.collect())
+        }
+        other => panic!("{other} is not in the descriptions of requests"),
+    }
+}
+
+/// Values that a schema does not describe, each with one mistake: something left out, of another type, or too much.
+fn mistaken(description: &Value, schema: &Value, right: &Value) -> Vec<Value> {
+    let schema = meant(description, schema);
+    let Value::Object(object) = right else {
+        return vec![if right.is_string() {
+            json!(7)
+        } else {
+            json!("seven")
+        }];
+    };
+    let with = |name: &str, value: Option<Value>| {
+        let mut changed = object.clone();
+        match value {
+            Some(value) => changed.insert(name.into(), value),
+            None => changed.remove(name),
+        };
+        Value::Object(changed)
+    };
+    let required = schema["required"].as_array().into_iter().flatten();
+    let mut all: Vec<_> = required
+        .map(|name| with(name.as_str().unwrap(), None))
+        .collect();
+    all.push(with("more", Some(json!(1))));
+    for (name, value) in object {
+        let changes = mistaken(description, &schema["properties"][name], value);
+        all.extend(changes.into_iter().map(|value| with(name, Some(value))));
+    }
+    all
+}
+
+#[tokio::test]
+async fn requests_are_taken_as_the_description_says_and_no_others() {
+    let description: Value = serde_yaml_ng::from_str(DESCRIPTION).unwrap();
+    let folder = tempfile::tempdir().unwrap();
+    let mut bodies = 0;
+    for (path, item) in description["paths"].as_object().unwrap() {
+        if item["post"].is_null() {
+            continue;
+        }
+        let schema = &item["post"]["requestBody"]["content"]["application/json"]["schema"];
+        let variants = schema["oneOf"].as_array().cloned();
+        for schema in variants.unwrap_or_else(|| vec![schema.clone()]) {
+            let (console, _, _commands) = crate::state::tests::proposed();
+            let client = Client::of(page(console, folder.path()));
+            let right = match schema.is_null() {
+                true => json!({}),
+                false => example(&description, &schema),
+            };
+            let answer = client.post(path, "key", &right.to_string()).await;
+            let status = answer.status.as_u16().to_string();
+            let described = &item["post"]["responses"][&status];
+            assert!(
+                described.is_object(),
+                "{path} {right}: {status} {}",
+                answer.text
+            );
+            if answer.status == StatusCode::OK {
+                let schema = schema_of_answer(&description, path, "post");
+                let mistakes = undescribed(&description, schema, &answer.json(), path);
+                assert_eq!(mistakes, [""; 0]);
+            }
+            if schema.is_null() {
+                continue;
+            }
+            bodies += 1;
+            for wrong in mistaken(&description, &schema, &right) {
+                let answer = client.post(path, "key", &wrong.to_string()).await;
+                let refused = [StatusCode::BAD_REQUEST, StatusCode::UNPROCESSABLE_ENTITY];
+                assert!(
+                    refused.contains(&answer.status),
+                    "{path} {wrong}: {}",
+                    answer.text
+                );
+            }
+        }
+    }
+    assert_eq!(bodies, 12);
+}
+
+/// The page's scripts and what they import.
+#[test]
+fn the_page_is_the_files_of_this_repository_and_nothing_else() {
+    let served = PAGE.map(|(path, ..)| path);
+    for (path, _, contents) in PAGE {
+        let text = String::from_utf8_lossy(contents);
+        let named = text
+            .split([' ', '\n', '(', '='])
+            .filter_map(|word| word.strip_prefix('"')?.split('"').next())
+            .filter(|name| {
+                [".js", ".css", ".svg"]
+                    .iter()
+                    .any(|end| name.ends_with(end))
+            });
+        for name in named {
+            let name = format!("/{}", name.trim_start_matches("./"));
+            assert!(served.contains(&name.as_str()), "{path} loads {name}");
+        }
+        for dynamic in ["import(", "eval(", "importScripts", "new Function"] {
+            assert!(!text.contains(dynamic), "{path}: {dynamic}");
+        }
     }
 }

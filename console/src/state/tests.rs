@@ -3,6 +3,7 @@ use crate::preview::ScoreMaps;
 use crate::preview::tests::{planned, unplanned};
 use crate::run::{NodeReport, Watch};
 use ::heightmap::{Heightmap, Workspace};
+use bags::DemonstrationStep;
 use nalgebra::{Isometry2, Point2};
 use pick_place::{PickPlace, PrimitiveSettings};
 use std::sync::Arc;
@@ -88,7 +89,7 @@ fn result(id: ProposalId, outcome: StepOutcome, stamp_s: u64) -> StepResult {
 }
 
 /// An active console with an open proposal 7 and an operator, and what it commands.
-fn proposed() -> (Console, ViewerId, mpsc::UnboundedReceiver<Command>) {
+pub(crate) fn proposed() -> (Console, ViewerId, mpsc::UnboundedReceiver<Command>) {
     let watch = Watch {
         nodes: Vec::new(),
         executor: "/suction_executor".into(),
@@ -109,6 +110,28 @@ fn proposed() -> (Console, ViewerId, mpsc::UnboundedReceiver<Command>) {
         ada
     });
     (console, ada, commands)
+}
+
+/// A demonstration of one step.
+pub(crate) fn demonstration(problem: &str) -> Demonstration {
+    let Proposal {
+        action, settings, ..
+    } = proposal(7, "");
+    let step = DemonstrationStep {
+        observation: image(0.0),
+        action,
+        settings,
+        module: "lesson".into(),
+        delta_reward: 1.0,
+        outcome: pick_place::Outcome::Placed,
+    };
+    Demonstration {
+        problem: problem.into(),
+        seed: 0,
+        start_seed: 0,
+        steps: vec![step],
+        last: image(0.1),
+    }
 }
 
 /// A console whose state has something in every field.

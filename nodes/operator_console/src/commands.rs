@@ -85,6 +85,7 @@ impl Commands {
     pub fn carry_out(&self, node: &Node, command: Command) {
         match command {
             Command::Confirm(confirmation) => self.confirm(node, &confirmation),
+            Command::Presence => self.publish_presence(node),
             Command::Propose(proposal) => self.propose(&proposal),
             Command::Home(name) => self.ask_for_home(node, &name),
             Command::SetStep(step, name) => self.set_step(node, step, &name),

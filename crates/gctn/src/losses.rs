@@ -95,7 +95,7 @@ pub(crate) fn place_logits(
 
 /// What windows say of each place, and what was said of it before the pick.
 fn correlated(grid: &Grid, features: &Features, windows: &Tensor) -> Tensor {
-    let logits = correlate(&features.key, windows, grid) * &features.scale;
+    let logits = correlate(&features.key, &(windows * &features.scale), grid);
     match &features.first {
         Some(first) => logits + first.place.unsqueeze(1),
         None => logits,

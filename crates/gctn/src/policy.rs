@@ -84,6 +84,7 @@ impl Policy {
     }
 
     pub(crate) fn new(model: Model, card: ModelCard, device: tch::Device) -> Self {
+        model.prepare();
         Self {
             model,
             card,

@@ -55,7 +55,8 @@ impl UNet {
     pub fn forward(&self, input: &Tensor) -> Tensor {
         let (mut x, skips) = self.encoder.forward(input);
         for (rise, skip) in self.rises.iter().zip(skips.iter().rev()) {
-            x = upsample(&rise.lateral.forward(&x)) + skip;
+            x = upsample(&rise.lateral.at_each_cell(&x));
+            x += skip;
             x = rise.block.forward(&x);
         }
         x

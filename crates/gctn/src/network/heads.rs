@@ -22,8 +22,9 @@ impl Block {
     }
 
     pub fn forward(&self, x: &Tensor) -> Tensor {
-        let y = self.second.forward(&self.first.forward(x).relu_());
-        (y + x).relu_()
+        let mut y = self.second.forward(&self.first.forward(x).relu_());
+        y += x;
+        y.relu_()
     }
 }
 
@@ -65,7 +66,7 @@ impl Heads {
         let heads = self.heads.forward(x).relu_();
         let head = |index: i64, conv: &Conv| {
             let x = heads.narrow(1, index * self.channels, self.channels);
-            conv.forward(&x).to_kind(kind)
+            conv.at_each_cell(&x).to_kind(kind)
         };
         Features {
             pick: head(0, &self.pick).squeeze_dim(1),

@@ -107,7 +107,7 @@ impl MatchingNet {
         let x = self.heads.forward(&self.trunk.forward(&input)).relu_();
         let head = |index: i64, conv: &Conv| {
             let x = x.narrow(1, index * self.channels, self.channels);
-            conv.forward(&x).to_kind(self.scale.kind())
+            conv.at_each_cell(&x).to_kind(self.scale.kind())
         };
         let place = head(0, &self.place).squeeze_dim(1);
         // The place teaches the embedding what to look like, and not the other way round.

@@ -202,6 +202,19 @@ impl Model {
         }
     }
 
+    /// Converts the weights for decisions. Later changes of the flat weights have no effect.
+    pub fn prepare(&self) {
+        self.parameters.prepare(self.kind());
+    }
+
+    /// Kind of numbers that the convolutions compute in.
+    fn kind(&self) -> Kind {
+        match self.precision {
+            Precision::F32 => self.parameters.flat.kind(),
+            Precision::Bf16 => Kind::BFloat16,
+        }
+    }
+
     /// Whether the network says if a step is done.
     pub fn says_done(&self) -> bool {
         matches!(self.nets, Nets::Matching(_))
@@ -215,10 +228,7 @@ impl Model {
     /// Runs the convolutions. `input` is what [`crate::input::tensor`] makes, on the weights' device.
     pub fn forward(&self, input: &Tensor) -> Features {
         let input = input.to_kind(self.parameters.flat.kind());
-        let kind = match self.precision {
-            Precision::F32 => input.kind(),
-            Precision::Bf16 => Kind::BFloat16,
-        };
+        let kind = self.kind();
         match &self.nets {
             Nets::Compact(net) => net.forward(&input, kind),
             Nets::GrConvnet(net) => net.forward(&input, kind),

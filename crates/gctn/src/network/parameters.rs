@@ -138,6 +138,16 @@ impl Parameters {
         self.flat.numel()
     }
 
+    /// Converts the kernels of convolutions to `kind`, channels last in memory, so that no call of [`Conv::forward`] does. They are no
+    /// longer views of the flat tensor: a network that is prepared cannot be trained.
+    pub fn prepare(&self, kind: Kind) {
+        let tensors = self.entries.iter().map(|(_, tensor)| tensor);
+        for kernel in tensors.filter(|tensor| tensor.dim() == 4) {
+            let prepared = channels_last(&kernel.to_kind(kind));
+            kernel.shallow_clone().set_data(&prepared);
+        }
+    }
+
     /// From now on gradients reach the weights.
     pub fn require_gradients(&self) -> Vec<Tensor> {
         let tensors = self.entries.iter();
@@ -162,6 +172,18 @@ impl Conv {
         let [weight, bias] = [&self.weight, &self.bias].map(|tensor| tensor.to_kind(x.kind()));
         let (stride, padding) = ([self.stride; 2], [self.padding; 2]);
         x.conv2d(&weight, Some(&bias), stride, padding, [1, 1], 1)
+    }
+
+    /// The same as [`Conv::forward`] for a 1x1 kernel at stride 1, as one product of matrices. `x` has its channels last in memory, and
+    /// may be some channels of a larger tensor: it is not copied. The result has its channels last too.
+    pub fn at_each_cell(&self, x: &Tensor) -> Tensor {
+        let [weight, bias] = [&self.weight, &self.bias].map(|tensor| tensor.to_kind(x.kind()));
+        let size = x.size();
+        x.permute([0, 2, 3, 1])
+            .reshape([-1, size[1]])
+            .linear(&weight.flatten(1, -1), Some(&bias))
+            .view([size[0], size[2], size[3], -1])
+            .permute([0, 3, 1, 2])
     }
 }
 

@@ -14,6 +14,7 @@ import re
 import signal
 import socket
 import ssl
+import subprocess
 import sys
 import time
 import urllib.error
@@ -31,7 +32,7 @@ from processes import REPOSITORY, Process
 from rcl_interfaces.srv import SetParameters
 from rclpy.parameter import Parameter
 from rosbags.highlevel import AnyReader
-from sctn_msgs.msg import StepConfirmation, StepResult
+from sctn_msgs.msg import OperatorPresence, StepConfirmation, StepResult
 
 STEPS = 6
 # A start of the blocks that is another one than that of the lesson.
@@ -166,11 +167,16 @@ def test_a_person_rejects_once_and_then_approves_a_run_of_stacking_to_its_end_by
         until(lambda view=view: pixels(view, marked) > 20, "mark on a camera's image", 20.0)
     unscored = [pixels(view, blue) for view in views]
     table = ada.page.get_by_role("img", name="The table now, from above")
-    seen = table.evaluate("canvas => canvas.toDataURL()")
+    # As colours, as heights, as what differs from the goal, and as scores: each is another picture.
     ada.reaches(ada.page.get_by_label("Colour"))
-    ada.page.keyboard.press("ArrowUp")
-    expect(ada.page.get_by_label("Place scores")).to_be_checked()
-    until(lambda: table.evaluate("canvas => canvas.toDataURL()") != seen, "scores", 20.0)
+    pictures = [table.evaluate("canvas => canvas.toDataURL()")]
+    for mode in ("Height", "Difference", "Pick scores", "Place scores"):
+        ada.page.keyboard.press("ArrowDown")
+        expect(ada.page.get_by_role("radio", name=mode)).to_be_checked()
+        if mode == "Difference":
+            expect(ada.page.get_by_text(re.compile(r"\([0-9.]+ % of it differs from the goal\)"))).to_be_visible()
+        until(lambda: table.evaluate("canvas => canvas.toDataURL()") not in pictures, mode, 20.0)
+        pictures.append(table.evaluate("canvas => canvas.toDataURL()"))
     for view, before in zip(views, unscored, strict=True):
         until(lambda view=view, before=before: pixels(view, blue) > before + 10, "scores on a camera's image", 20.0)
     ada.page.keyboard.press("ArrowDown")
@@ -496,6 +502,14 @@ def test_a_motion_stops_when_the_deciding_page_is_closed_and_the_run_goes_on_whe
     ada.takes_control()
     ada.reads("proposes")
     ada.can("Approve")
+    # Five times a second everybody hears that she is there.
+    heard: list[OperatorPresence] = []
+    operator.node.create_subscription(OperatorPresence, "operator_presence", heard.append, EVENT)
+    operator.until(lambda: heard, "operator_presence", 10.0)
+    heard.clear()
+    operator.spin(3.0)
+    assert 12 <= len(heard) <= 18, len(heard)
+    assert {(one.operator_name, one.is_present) for one in heard} == {("Ada", True)}
     slow_down(operator, 0.5)
     results = operator.count("step_result")
     ada.button("Approve").click()
@@ -752,6 +766,13 @@ def test_a_program_approves_a_step_and_is_refused_what_is_stale(start, decided) 
     until(lambda: len(decided()) >= 2, "decisions on the graph", 30.0)
     said = [one.decision for one in decided()]
     assert said == [StepConfirmation.REJECT, StepConfirmation.APPROVE]
+    # The example, as a program of its own, takes over and goes on to the end.
+    example = [sys.executable, REPOSITORY / "docs/examples/operator_console.py", address]
+    done = subprocess.run(example, input="y\n" * 2 * STEPS, capture_output=True, text=True, timeout=240, check=False)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.endswith("all steps are done\n")
+    assert console.state()["phase"] == "complete"
+    assert {one.operator_name for one in decided()} == {"a program", "operator_console.py"}
 
 
 def test_the_page_is_served_with_tls_and_another_address_needs_it(start, tmp_path: pathlib.Path) -> None:

@@ -240,7 +240,10 @@ async function ask(what) {
 
 // A lesson: pick and place are chosen as in a correction, the planned motion is shown, and carried out when the person says so.
 $("execute").addEventListener("click", () => {
-  if (!obstacle("execute")) ask(() => api.post("lesson/execute"));
+  const why = obstacle("execute");
+  if (!why) return void ask(() => api.post("lesson/execute"));
+  answer = why;
+  renderButtons();
 });
 $("change").addEventListener("click", () => ask(() => api.post("lesson/change")));
 $("leave-home").addEventListener("click", () => ask(() => api.post("decisions", { proposal_id: state.home.proposal_id, decision: "reject" })));

@@ -51,11 +51,13 @@ def main() -> None:
         try:
             ada = Person(browser, address_of(launch, until), "Ada")
             ada.takes_control()
+            operator.until(operator.executor_is_ready, "executor that has checked its driver", 60.0)
             ada.page.evaluate(WATCH)
             for _ in range(STEPS):
                 for name in ("Approve", "It succeeded"):
                     ada.can(name)
                     operator.spin(0.5)
+                    ada.can(name)
                     said, seen = len(heard["confirmation"]), len(heard["heightmap"])
                     drawn = ada.page.evaluate("drawn.length")
                     ada.button(name).click()
@@ -63,10 +65,8 @@ def main() -> None:
                     clicks_ms.append(heard["confirmation"][said] - ada.page.evaluate("clicks.at(-1)"))
                     if name == "Approve":
                         operator.until(lambda seen=seen: len(heard["heightmap"]) > seen, "heightmap", 60.0)
-                        operator.spin(1.0)
-                        times = ada.page.evaluate("drawn")[drawn:]
-                        if times:
-                            pixels_ms.append(times[0] - heard["heightmap"][seen])
+                        operator.until(lambda drawn=drawn: ada.page.evaluate("drawn.length") > drawn, "picture of it", 10.0)
+                        pixels_ms.append(ada.page.evaluate("drawn")[drawn] - heard["heightmap"][seen])
                 if "All steps" in ada.headline():
                     break
         finally:

@@ -22,7 +22,7 @@ import numpy as np
 os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
 os.environ.setdefault("RMW_IMPLEMENTATION", "rmw_fastrtps_cpp")
 
-from browser import PATIENCE_MS, Person, address_of, chromium
+from browser import Person, address_of, chromium
 from cell_operator import Operator, nanoseconds
 from playwright.sync_api import expect
 from processes import REPOSITORY, Process, free_domain
@@ -183,16 +183,8 @@ def show(person: Person, operator: Operator, shown: int) -> None:
 def carry_out(person: Person) -> None:
     """Looks at the planned motion, and has it carried out."""
     expect(person.page.get_by_text(re.compile(r"The planned motion takes \d"))).to_be_visible()
-    for tries in range(1, 4):
-        person.can("Carry it out")
-        person.button("Carry it out").click()
-        try:
-            expect(person.button("Carry it out")).to_be_hidden(timeout=PATIENCE_MS / 4)
-            return
-        except AssertionError:
-            # On a busy machine a stream may be stale for a moment: the page says so, and a person clicks again.
-            if tries == 3:
-                raise
+    carry_out = "Carry it out"
+    person.presses(carry_out, lambda wait_ms: expect(person.button(carry_out)).to_be_hidden(timeout=wait_ms))
 
 
 def save(person: Person, name: str) -> None:
@@ -255,9 +247,7 @@ def repeat(person: Person, operator: Operator, name: str = NAME) -> Repetition:
             else:
                 decision = "It failed: try again"
                 went.tried_again += 1
-        person.can(decision)
-        person.button(decision).click()
-        person.reads_otherwise(headline)
+        person.presses(decision, lambda wait_ms, headline=headline: person.reads_otherwise(headline, wait_ms))
 
 
 def correct_first_step(person: Person, operator: Operator, name: str = NAME) -> None:

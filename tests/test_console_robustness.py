@@ -6,6 +6,7 @@ MOMENTS=50 SECONDS=60 VIEWING_S=600 .venv/bin/python -m pytest tests/test_consol
 from __future__ import annotations
 
 import http.client
+import json
 import os
 import pathlib
 import random
@@ -153,6 +154,7 @@ def test_random_input_of_somebody_with_the_token_moves_nothing_and_the_page_work
     connection = http.client.HTTPConnection(url.netloc, timeout=10)
     # Whoever sends this has the token and a session, and does not decide.
     headers = {**eve._headers, "Content-Type": "application/json"}
+    begun_kb = resident_kb(process)
     end = time.monotonic() + SECONDS
     requests, messages = 0, 0
     watcher: WebSocket | None = None
@@ -173,9 +175,15 @@ def test_random_input_of_somebody_with_the_token_moves_nothing_and_the_page_work
             messages += 1
         except OSError:
             watcher = None
-    print(f"{requests} requests, {messages} messages")
+    grown_kb = resident_kb(process) - begun_kb
+    print(f"{requests} requests, {messages} messages, {grown_kb} kB more")
     assert requests > 100 and messages > 50
     assert process.exit_code is None
+    # Nothing of it stays: neither in memory nor is a secret said.
+    assert grown_kb < 4096
+    secrets = [ada._headers["X-Session"], eve._headers["X-Session"], ada._headers["Authorization"].removeprefix("Bearer ")]
+    told = process.output() + process.errors() + json.dumps(ada.state())
+    assert not [secret for secret in secrets if secret in told]
     ada.post("presence")
     assert ada.state()["operator"] == ada.viewer
     assert ada.state()["proposal"]["id"] == proposal["id"]

@@ -26,6 +26,8 @@ mod listener;
 mod preview;
 mod refusal;
 mod run;
+#[cfg(test)]
+mod samples;
 mod server;
 mod session;
 mod state;

@@ -1,39 +1,24 @@
 use super::*;
 use crate::preview::tests::{planned, unplanned};
+use crate::samples;
 use heightmap::Workspace;
-use nalgebra::{Isometry2, Point2};
-use pick_place::{PickPlace, PrimitiveSettings};
+use nalgebra::Isometry2;
+use pick_place::PickPlace;
 use step_protocol::{Confirmation, ProposalStatus, RefusalKind, StepResult};
 
 const NOW: Duration = Duration::from_secs(100);
-const WORKSPACE: Workspace = Workspace {
-    origin_m: Point2::new(0.0, 0.0),
-    rows: 4,
-    cols: 3,
-    pixel_size_m: 0.1,
-    z_min_m: 0.0,
-    z_max_m: 0.28,
-};
+const WORKSPACE: Workspace = samples::workspace(4, 3, 0.1);
 
 fn id(proposal: u64) -> ProposalId {
     ProposalId(proposal)
 }
 
 fn image(height_m: f32) -> Heightmap {
-    Heightmap {
-        rgb: vec![100; 36],
-        height_m: vec![height_m; 12],
-        workspace: WORKSPACE,
-    }
+    samples::image(WORKSPACE, height_m)
 }
 
 fn heightmap(stamp_s: u64, height_m: f32) -> Observation {
-    Observation {
-        stamp: Duration::from_secs(stamp_s),
-        frame: "world".into(),
-        heightmap: Arc::new(image(height_m)),
-        coverage: Coverage::default(),
-    }
+    samples::observation(image(height_m), stamp_s)
 }
 
 fn goal(step: u32, attempt: u32, stamp_s: u64) -> Goal {
@@ -44,20 +29,14 @@ fn goal(step: u32, attempt: u32, stamp_s: u64) -> Goal {
         step,
         step_count: 2,
         attempt,
-        complete: false,
         module: "stacking".into(),
-        settings: PrimitiveSettings::RIGID,
-        image: Arc::new(image(0.01 * step as f32)),
-        coverage: Coverage::default(),
-        previous: None,
+        ..samples::goal(image(0.01 * step as f32))
     }
 }
 
 fn proposal(number: u64, step: u32, attempt: u32, stamp_s: u64) -> Proposal {
     let pose = Isometry2::translation(0.15, 0.15);
     Proposal {
-        id: id(number),
-        frame: "world".into(),
         stamp: Duration::from_secs(stamp_s),
         problem: "stacking".into(),
         step,
@@ -67,12 +46,7 @@ fn proposal(number: u64, step: u32, attempt: u32, stamp_s: u64) -> Proposal {
             pick: pose,
             place: pose,
         },
-        settings: PrimitiveSettings::RIGID,
-        pick_score: 0.5,
-        place_score: 0.5,
-        success_probability: None,
-        checkpoint: String::new(),
-        author: String::new(),
+        ..samples::proposal(number)
     }
 }
 
@@ -93,15 +67,7 @@ fn refused(proposal: u64, status: Option<ProposalStatus>) -> StepResult {
 }
 
 fn result(proposal: u64, outcome: StepOutcome, stamp_s: u64) -> StepResult {
-    let moved = outcome.arm_moved();
-    StepResult {
-        stamp: Duration::from_secs(stamp_s),
-        proposal_id: id(proposal),
-        outcome,
-        reason: "for a reason".into(),
-        duration: Duration::from_secs(if moved { 5 } else { 0 }),
-        status: None,
-    }
+    samples::result(id(proposal), outcome, stamp_s)
 }
 
 /// A node hears a camera, whose newest image is of this age, and says how a part of it is.
@@ -129,12 +95,7 @@ fn report(node: &str, state: &str, message: &str) -> NodeReport {
 
 /// A run in which all streams are fresh.
 fn fresh() -> Run {
-    let mut run = Run::new(Watch {
-        nodes: vec!["/camera_fusion".into(), "/suction_executor".into()],
-        executor: "/suction_executor".into(),
-        stale_after: Duration::from_secs(3),
-        changes: ChangeRules::default(),
-    });
+    let mut run = Run::new(samples::watch(&["/camera_fusion", "/suction_executor"]));
     hears_camera(&mut run, "/camera_fusion", "0.5");
     run.on_report(report("/suction_executor", "topics", "all well"), NOW);
     run.on_report(report("/suction_executor", "driver", "ready"), NOW);
@@ -561,12 +522,7 @@ fn a_demonstration_that_is_repeated_before_a_motion_was_confirmed_begins_anew() 
 
 #[test]
 fn without_an_executor_the_words_say_so() {
-    let mut run = Run::new(Watch {
-        nodes: vec!["/suction_executor".into()],
-        executor: "/suction_executor".into(),
-        stale_after: Duration::from_secs(3),
-        changes: ChangeRules::default(),
-    });
+    let mut run = Run::new(samples::watch(&["/suction_executor"]));
     run.on_heightmap(heightmap(10, 0.0), NOW);
     run.on_goal(goal(1, 0, 0), NOW).unwrap();
     run.on_proposal(proposal(7, 1, 0, 10)).unwrap();

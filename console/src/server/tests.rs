@@ -1,5 +1,5 @@
 use super::*;
-use crate::run::{Run, Watch};
+use crate::run::Run;
 use crate::session::Sessions;
 use axum::body::Body;
 use axum::body::to_bytes;
@@ -7,7 +7,7 @@ use axum::extract::Request;
 use axum::http::HeaderMap;
 use axum::http::Method;
 use axum::http::header::CONTENT_SECURITY_POLICY;
-use heightmap::{ChangeRules, Intrinsics};
+use heightmap::Intrinsics;
 use nalgebra::Isometry3;
 use serde_json::{Value, json};
 use std::path::Path;
@@ -53,14 +53,8 @@ impl Answer {
 impl Client {
     /// Of a console that has heard nothing.
     fn new() -> Self {
-        let watch = Watch {
-            nodes: Vec::new(),
-            executor: "/suction_executor".into(),
-            stale_after: Duration::from_secs(3),
-            changes: ChangeRules::default(),
-        };
         let sessions = Sessions::new(4, Duration::from_secs(60));
-        let console = Console::new(Run::new(watch), sessions);
+        let console = Console::new(Run::new(crate::samples::watch(&[])), sessions);
         Self::of(page(console, Path::new("no/such/folder")))
     }
 

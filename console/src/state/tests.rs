@@ -1,103 +1,44 @@
 use super::*;
 use crate::preview::ScoreMaps;
 use crate::preview::tests::{planned, unplanned};
-use crate::run::{NodeReport, Watch};
-use ::heightmap::{Heightmap, Workspace};
+use crate::run::NodeReport;
+use crate::samples::{self, result};
+use ::heightmap::Heightmap;
 use bags::DemonstrationStep;
-use nalgebra::{Isometry2, Point2};
-use pick_place::{PickPlace, PrimitiveSettings};
-use std::sync::Arc;
-use step_protocol::{Coverage, Goal, ProposalStatus, Reward};
+use pick_place::PrimitiveSettings;
+use step_protocol::{Goal, ProposalStatus, Reward};
 
 const SETTINGS: PrimitiveSettings = PrimitiveSettings::RIGID;
 
 /// A table of one cell of a metre.
 fn image(height_m: f32) -> Heightmap {
-    let workspace = Workspace {
-        origin_m: Point2::origin(),
-        rows: 1,
-        cols: 1,
-        pixel_size_m: 1.0,
-        z_min_m: 0.0,
-        z_max_m: 1.0,
-    };
-    Heightmap {
-        height_m: vec![height_m],
-        ..Heightmap::new(workspace)
-    }
+    samples::image(samples::workspace(1, 1, 1.0), height_m)
 }
 
 fn heightmap(stamp_s: u64, height_m: f32) -> Observation {
-    Observation {
-        stamp: Duration::from_secs(stamp_s),
-        frame: "world".into(),
-        heightmap: Arc::new(image(height_m)),
-        coverage: Coverage::default(),
-    }
+    samples::observation(image(height_m), stamp_s)
 }
 
 fn goal(demonstration: &str, complete: bool) -> Goal {
     Goal {
-        stamp: Duration::ZERO,
-        problem: String::new(),
         demonstration: demonstration.into(),
-        step: 1,
-        step_count: 1,
-        attempt: 0,
         complete,
-        module: String::new(),
-        settings: SETTINGS,
-        image: Arc::new(image(0.0)),
-        coverage: Coverage::default(),
-        previous: None,
+        ..samples::goal(image(0.0))
     }
 }
 
 /// A proposal for the first step, made by this checkpoint.
 fn proposal(id: u64, checkpoint: &str) -> Proposal {
-    let action = PickPlace {
-        pick: Isometry2::identity(),
-        place: Isometry2::identity(),
-    };
     Proposal {
-        id: ProposalId(id),
-        frame: "world".into(),
-        stamp: Duration::ZERO,
-        problem: String::new(),
-        step: 1,
-        attempt: 0,
-        module: String::new(),
-        action,
-        settings: SETTINGS,
-        pick_score: 0.0,
-        place_score: 0.0,
-        success_probability: None,
         checkpoint: checkpoint.into(),
-        author: String::new(),
-    }
-}
-
-fn result(id: ProposalId, outcome: StepOutcome, stamp_s: u64) -> StepResult {
-    StepResult {
-        stamp: Duration::from_secs(stamp_s),
-        proposal_id: id,
-        outcome,
-        reason: String::new(),
-        duration: Duration::from_secs(1),
-        status: None,
+        ..samples::proposal(id)
     }
 }
 
 /// An active console with an open proposal 7 and an operator, and what it commands.
 pub(crate) fn proposed() -> (Console, ViewerId, mpsc::UnboundedReceiver<Command>) {
-    let watch = Watch {
-        nodes: Vec::new(),
-        executor: "/suction_executor".into(),
-        stale_after: Duration::from_secs(3),
-        changes: ::heightmap::ChangeRules::default(),
-    };
     let sessions = Sessions::new(4, Duration::from_secs(60));
-    let console = Console::new(Run::new(watch), sessions);
+    let console = Console::new(Run::new(samples::watch(&[])), sessions);
     let commands = console.connect();
     let ada = console.change(|state, now| {
         let ada = state.sessions.join("Ada", "key".into(), now).unwrap();
@@ -547,12 +488,7 @@ fn a_run_of_a_taught_task_is_counted_with_its_checkpoint_when_the_policy_has_mov
     on_goal(goal("blocks/0", false));
     // The one of before has no checkpoint.
     console.change(|state, now| {
-        state.run = Run::new(Watch {
-            nodes: Vec::new(),
-            executor: "/suction_executor".into(),
-            stale_after: Duration::from_secs(3),
-            changes: ::heightmap::ChangeRules::default(),
-        });
+        state.run = Run::new(samples::watch(&[]));
         state.run.on_joints(Vec::new(), Vec::new(), now);
         state.on_heightmap(heightmap(0, 0.0), now);
         state.on_goal(goal("blocks/0", false), now).unwrap();

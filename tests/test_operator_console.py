@@ -843,6 +843,11 @@ def test_hostile_input_moves_nothing_and_the_page_works_on(start, decided) -> No
     head = b"POST /api/v1/decisions HTTP/1.1\r\n" + host + b"Authorization: Bearer " + token.encode()
     answer = send(head + b"\r\nContent-Type: application/json\r\nContent-Length: 100000000\r\n\r\n" + bytes(1 << 20))
     assert b" 4" in answer[:13] or answer == b"", answer
+    # A page of another site is refused, token and all, on the WebSocket too.
+    for path, more in (("state", b""), ("live", b"Connection: Upgrade\r\nUpgrade: websocket\r\n")):
+        foreign = f"GET /api/v1/{path} HTTP/1.1\r\n".encode() + host + b"Origin: http://evil.example\r\n" + more
+        answer = send(foreign + b"Authorization: Bearer " + token.encode() + b"\r\n\r\n")
+        assert answer.startswith(b"HTTP/1.1 403"), answer
     with pytest.raises(CLIENT.Refused) as wrong:
         CLIENT.Console(address.replace(token, "0" * len(token)), "Eve")
     assert wrong.value.status == 401

@@ -139,6 +139,7 @@ def test_a_person_rejects_once_and_then_approves_a_run_of_stacking_to_its_end_by
     expect(ada.page.get_by_text(re.compile("Made by gctn_policy with ten_problems"))).to_be_visible()
     expect(ada.page.get_by_text(re.compile(r"The planned motion takes \d"))).to_be_visible()
     expect(ada.page.get_by_text("100 % of the planned")).to_be_visible()
+    expect(ada.page.get_by_text(re.compile(r"from above, the robot below, \d+ s old"))).to_be_visible()
     slider = ada.page.get_by_role("slider", name="Time")
     robot = ada.page.get_by_role("img", name="The robot in its cell")
     drawn = []

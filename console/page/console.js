@@ -610,6 +610,7 @@ function renderPictures() {
     boards.goal.canvas.dataset.drawn = goalDrawn;
     draw(boards.goal.canvas, goal, mode === "difference" || scored ? "color" : mode);
   }
+  setText($("now-age"), map ? `, ${Math.round(map.age_s)} s old` : "");
   setText($("goal-note"), state.goal ? `(step ${state.goal.step} of ${state.goal.step_count}, ${state.goal.module})` : "");
   if (correction && !state.lesson && !["proposed", "awaiting_proposal"].includes(state.phase)) return endCorrection();
   const shownStep = ["planning", "previewing", "moving"].includes(state.lesson?.phase) ? state.lesson : null;

@@ -10,7 +10,6 @@ import os
 import pathlib
 import statistics
 import tempfile
-import time
 
 os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
 os.environ["RMW_IMPLEMENTATION"] = "rmw_fastrtps_cpp"
@@ -32,6 +31,11 @@ WATCH = """() => {
 }"""
 
 
+def arrival_ms(about: dict[str, int]) -> float:
+    """When a message arrived over DDS [ms since 1970], whenever this program got to look at it."""
+    return about["received_timestamp"] / 1e6
+
+
 def words(name: str, values_ms: list[float]) -> str:
     """Median and longest."""
     return f"{name}: median {statistics.median(values_ms):.1f} ms, longest {max(values_ms):.1f} ms, of {len(values_ms)}"
@@ -45,8 +49,10 @@ def main() -> None:
         launch = Process("sctn", arguments, domain, pathlib.Path(scratch))
         heard: dict[str, list[float]] = {"heightmap": [], "confirmation": []}
         node = operator.node
-        node.create_subscription(Heightmap, "heightmap", lambda _: heard["heightmap"].append(1000 * time.time()), LATCHED)
-        node.create_subscription(StepConfirmation, "step_confirmation", lambda _: heard["confirmation"].append(1000 * time.time()), EVENT)
+        node.create_subscription(Heightmap, "heightmap", lambda _, about: heard["heightmap"].append(arrival_ms(about)), LATCHED)
+        node.create_subscription(
+            StepConfirmation, "step_confirmation", lambda _, about: heard["confirmation"].append(arrival_ms(about)), EVENT
+        )
         pixels_ms, clicks_ms = [], []
         try:
             ada = Person(browser, address_of(launch, until), "Ada")

@@ -792,16 +792,21 @@ function renderMessages() {
 
 let restAsked = false;
 
+/** Calls back when the browser has painted and has nothing better to do, at the latest after 200 ms. */
+const whenIdle = window.requestIdleCallback
+  ? (callback) => requestIdleCallback(callback, { timeout: 200 })
+  : (callback) => requestAnimationFrame(() => setTimeout(callback));
+
 /** What a decision needs is shown at once; the rest after the browser has painted it. */
 function render() {
   if (!state) return;
   renderDecision();
   if (restAsked) return;
   restAsked = true;
-  requestAnimationFrame(() => setTimeout(() => {
+  whenIdle(() => {
     restAsked = false;
     renderRest();
-  }));
+  });
 }
 
 function renderDecision() {

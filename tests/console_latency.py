@@ -1,7 +1,7 @@
 """Measures the operator's page: `.venv/bin/python tests/console_latency.py`, with the programs built.
 
-How long from a new heightmap, as another node hears it, to its pixels on the page; and from a click to its
-step_confirmation, as another node hears it. A run of stacking, everything on this machine.
+How long from the publication of a heightmap to its pixels on the page, and from a click to the arrival of its step_confirmation
+at another node. A run of stacking, everything on this machine.
 """
 
 from __future__ import annotations
@@ -31,11 +31,6 @@ WATCH = """() => {
 }"""
 
 
-def arrival_ms(about: dict[str, int]) -> float:
-    """When a message arrived over DDS [ms since 1970], whenever this program got to look at it."""
-    return about["received_timestamp"] / 1e6
-
-
 def words(name: str, values_ms: list[float]) -> str:
     """Median and longest."""
     return f"{name}: median {statistics.median(values_ms):.1f} ms, longest {max(values_ms):.1f} ms, of {len(values_ms)}"
@@ -47,11 +42,14 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as scratch, chromium() as browser, Operator(domain) as operator:
         arguments = ["launch", "--problem", "stacking", "--seed", "10000", "--operator", "web"]
         launch = Process("sctn", arguments, domain, pathlib.Path(scratch))
+        # When a heightmap was published and when a confirmation arrived [ms since 1970], whenever this program gets to look at it.
         heard: dict[str, list[float]] = {"heightmap": [], "confirmation": []}
         node = operator.node
-        node.create_subscription(Heightmap, "heightmap", lambda _, about: heard["heightmap"].append(arrival_ms(about)), LATCHED)
         node.create_subscription(
-            StepConfirmation, "step_confirmation", lambda _, about: heard["confirmation"].append(arrival_ms(about)), EVENT
+            Heightmap, "heightmap", lambda _, about: heard["heightmap"].append(about["source_timestamp"] / 1e6), LATCHED
+        )
+        node.create_subscription(
+            StepConfirmation, "step_confirmation", lambda _, about: heard["confirmation"].append(about["received_timestamp"] / 1e6), EVENT
         )
         pixels_ms, clicks_ms = [], []
         try:

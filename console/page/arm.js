@@ -5,6 +5,10 @@
 const SIDES = 14;
 /** Heightmap cells along each side of a block of the table. */
 const BLOCK = 4;
+/** What is lower is the table itself [m]. */
+const FLAT_M = 0.004;
+/** Neighbours on the table are one face where red, green and blue differ by no more. */
+const SAME_COLOR = 6;
 /** Where the eye looks, how far it stands, and how wide it sees. */
 const TARGET = [0.42, 0, 0.18];
 const DISTANCE_M = 2.3;
@@ -297,28 +301,41 @@ export class Arm {
     for (const { corners, color, shade } of faces) this.#fill(context, eye, corners, color, shade);
   }
 
-  /** What lies on the table, as blocks. */
+  /** What lies on the table, as blocks; first the table itself, of which neighbours of nearly the same colour are one face. */
   #blocks(context, eye) {
     if (!this.#table?.picture) return;
     const { map, picture } = this.#table;
+    const edge = (index, start) => start + index * map.pixel_size_m;
     const blocks = [];
     for (let row = 0; row + BLOCK <= map.rows; row += BLOCK) {
+      const [y0, y1] = [edge(row, map.origin_y_m), edge(row + BLOCK, map.origin_y_m)];
+      let flat = null;
+      const finish = () => {
+        if (flat) this.#fill(context, eye, [[flat.x0, y0, 0], [flat.x1, y0, 0], [flat.x1, y1, 0], [flat.x0, y1, 0]], flat.color, 1);
+        flat = null;
+      };
       for (let col = 0; col + BLOCK <= map.cols; col += BLOCK) {
         const cell = (row + BLOCK / 2) * map.cols + col + BLOCK / 2;
-        const edge = (index, start) => start + index * map.pixel_size_m;
-        const [low, high] = [[edge(col, map.origin_x_m), edge(row, map.origin_y_m)], [edge(col + BLOCK, map.origin_x_m), edge(row + BLOCK, map.origin_y_m)]];
-        const middle = [(low[0] + high[0]) / 2, (low[1] + high[1]) / 2, 0];
-        blocks.push({ low, high, height: picture.height_m[cell], color: [...picture.rgb.subarray(3 * cell, 3 * cell + 3)], far: Math.hypot(...minus(middle, eye.at)) });
+        const color = picture.rgb.subarray(3 * cell, 3 * cell + 3);
+        const [x0, x1, height] = [edge(col, map.origin_x_m), edge(col + BLOCK, map.origin_x_m), picture.height_m[cell]];
+        if (height > FLAT_M) {
+          finish();
+          blocks.push({ x0, x1, y0, y1, height, color, far: Math.hypot((x0 + x1) / 2 - eye.at[0], (y0 + y1) / 2 - eye.at[1], eye.at[2]) });
+          continue;
+        }
+        if (flat && [0, 1, 2].some((part) => Math.abs(flat.color[part] - color[part]) > SAME_COLOR)) finish();
+        if (flat) flat.x1 = x1;
+        else flat = { x0, x1, color: [...color] };
       }
+      finish();
     }
     blocks.sort((a, b) => b.far - a.far);
-    for (const { low: [x0, y0], high: [x1, y1], height, color } of blocks) {
-      if (height > 0.004) {
-        const x = eye.at[0] > (x0 + x1) / 2 ? x1 : x0;
-        const y = eye.at[1] > (y0 + y1) / 2 ? y1 : y0;
-        this.#fill(context, eye, [[x, y0, 0], [x, y1, 0], [x, y1, height], [x, y0, height]], color, 0.75);
-        this.#fill(context, eye, [[x0, y, 0], [x1, y, 0], [x1, y, height], [x0, y, height]], color, 0.6);
-      }
+    for (const { x0, x1, y0, y1, height, color: seen } of blocks) {
+      const color = [...seen];
+      const x = eye.at[0] > (x0 + x1) / 2 ? x1 : x0;
+      const y = eye.at[1] > (y0 + y1) / 2 ? y1 : y0;
+      this.#fill(context, eye, [[x, y0, 0], [x, y1, 0], [x, y1, height], [x, y0, height]], color, 0.75);
+      this.#fill(context, eye, [[x0, y, 0], [x1, y, 0], [x1, y, height], [x0, y, height]], color, 0.6);
       this.#fill(context, eye, [[x0, y0, height], [x1, y0, height], [x1, y1, height], [x0, y1, height]], color, 1);
     }
   }

@@ -688,7 +688,8 @@ function renderMotion() {
   const table = `${map?.number} ${present?.number}`;
   if (present && $("arm").dataset.table !== table) {
     $("arm").dataset.table = table;
-    arm.setTable(map, present);
+    // It is much to draw: the picture from above is painted first.
+    afterPaint(() => arm.setTable(map, present));
   }
   if (state.joints) arm.setPositions(state.joints);
 }
@@ -792,10 +793,11 @@ function renderMessages() {
 
 let restAsked = false;
 
-/** Calls back when the browser has painted and has nothing better to do, at the latest after 200 ms. */
-const whenIdle = window.requestIdleCallback
-  ? (callback) => requestIdleCallback(callback, { timeout: 200 })
-  : (callback) => requestAnimationFrame(() => setTimeout(callback));
+/** Calls back once the browser has painted what is drawn by now and has nothing better to do, at the latest after 200 ms. */
+function afterPaint(callback) {
+  const next = window.requestIdleCallback ? () => requestIdleCallback(callback, { timeout: 200 }) : () => setTimeout(callback);
+  requestAnimationFrame(next);
+}
 
 /** What a decision needs is shown at once; the rest after the browser has painted it. */
 function render() {
@@ -803,7 +805,7 @@ function render() {
   renderDecision();
   if (restAsked) return;
   restAsked = true;
-  whenIdle(() => {
+  afterPaint(() => {
     restAsked = false;
     renderRest();
   });

@@ -5,6 +5,7 @@ mod bench;
 mod calibrate;
 mod camera_stream;
 mod check;
+mod cluster;
 mod compare;
 mod console;
 mod curves;

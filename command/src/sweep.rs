@@ -1,9 +1,10 @@
 //! `sctn sweep`.
 
+use crate::cluster::{Engine, Jobs};
 use crate::progress;
 use crate::root::Root;
 use crate::train::{Data, Snapshot, train};
-use anyhow::{Context, Result};
+use anyhow::{Context, Result, ensure};
 use clap::Args;
 use cpu_time::ProcessTime;
 use gctn::{Device, Policy, TrainingConfig};
@@ -11,6 +12,7 @@ use learning::{
     Actor, Episodes, Recipe, Run, RunResult, Score, SnapshotResult, Start, Sweep, evaluate,
     wilson_95,
 };
+use std::fs::{File, TryLockError};
 use std::path::{Path, PathBuf};
 
 /// Arguments of `sctn sweep`.
@@ -32,6 +34,15 @@ pub struct SweepCommand {
     /// List the runs, and do nothing
     #[arg(long)]
     list: bool,
+    /// Where to run: here, one run after the other, or each as a job of its own on a cluster whose hosts share all files
+    #[arg(long, value_enum, default_value_t)]
+    engine: Engine,
+    /// GPUs of each run on a cluster, with Ray also fractions [default: 1 where the training's device is cuda, else 0]
+    #[arg(long, value_name = "NUMBER")]
+    gpus: Option<f64>,
+    /// The Python that has the package ray, for --engine ray
+    #[arg(long, value_name = "PROGRAM", default_value = "python3")]
+    python: PathBuf,
 }
 
 /// `1/3` is the second of three parts.
@@ -53,34 +64,91 @@ impl SweepCommand {
             modules.insert(name.clone(), root.problem(name)?.modules().len());
         }
         let (index, count) = self.part;
-        let runs = sweep.runs(|problem| modules[problem]);
-        let runs: Vec<_> = runs.into_iter().skip(index).step_by(count).collect();
-        for (number, run) in runs.iter().enumerate() {
+        let all = sweep.runs(|problem| modules[problem]);
+        let total = all.len();
+        let runs: Vec<_> = all
+            .into_iter()
+            .enumerate()
+            .skip(index)
+            .step_by(count)
+            .collect();
+        if self.engine != Engine::Local && !self.list {
+            let to_do = runs.iter().filter(|(_, run)| !self.file(run).exists());
+            let parts = to_do.map(|(index, run)| (run.slug(), format!("{index}/{total}")));
+            self.jobs(root, &sweep, parts.collect())?
+                .carry_out(self.engine, &self.python)?;
+        }
+        let mut missing = Vec::new();
+        for (number, (_, run)) in runs.iter().enumerate() {
             let slug = run.slug();
-            let file = self.out.join(format!("{slug}.json"));
-            let done = file.exists();
-            let state = if done { "done" } else { "to do" };
+            let file = self.file(run);
+            let state = if file.exists() { "done" } else { "to do" };
             tracing::info!("run {} of {}: {slug}, {state}", number + 1, runs.len());
             if self.list {
                 continue;
             }
-            if done {
-                let name = || file.display().to_string();
-                let text = std::fs::read_to_string(&file).with_context(name)?;
-                println!(
-                    "{slug}: {}",
-                    line(&serde_json::from_str(&text).with_context(name)?)
-                );
+            if self.engine == Engine::Local && !file.exists() {
+                let recipe = sweep.recipe(run, modules[&run.problem]);
+                self.one(root, &sweep, run, recipe)
+                    .with_context(|| format!("run {slug}"))?;
+            }
+            if !file.exists() {
+                missing.push(slug);
                 continue;
             }
-            let recipe = sweep.recipe(run, modules[&run.problem]);
-            let result = self
-                .one(root, &sweep, run, recipe)
-                .with_context(|| format!("run {slug}"))?;
-            write_whole(&file, &serde_json::to_string_pretty(&result)?)?;
+            let name = || file.display().to_string();
+            let text = std::fs::read_to_string(&file).with_context(name)?;
+            let result = serde_json::from_str(&text).with_context(name)?;
             println!("{slug}: {}", line(&result));
         }
+        ensure!(
+            missing.is_empty(),
+            "{} of {} runs are not done: {}",
+            missing.len(),
+            runs.len(),
+            missing.join(", ")
+        );
         Ok(())
+    }
+
+    /// A job of `sctn sweep` for each run (its name and its part).
+    fn jobs(&self, root: &Root, sweep: &Sweep, parts: Vec<(String, String)>) -> Result<Jobs> {
+        let absolute = |path: &Path| -> Result<String> {
+            let path = std::path::absolute(path).with_context(|| path.display().to_string())?;
+            let text = path.to_str().with_context(|| {
+                format!("{}: expected a path in UTF-8 for a cluster", path.display())
+            })?;
+            Ok(text.to_owned())
+        };
+        let program = std::env::current_exe().context("path of the program")?;
+        let command = [
+            absolute(&program)?,
+            "--root".into(),
+            absolute(&root.join(""))?,
+            "sweep".into(),
+            "--sweep".into(),
+            absolute(&self.sweep)?,
+            "--demos".into(),
+            absolute(&self.demos)?,
+            "--out".into(),
+            absolute(&self.out)?,
+            "--part".into(),
+        ];
+        Ok(Jobs {
+            command: command.to_vec(),
+            parts,
+            cores: sweep.training.threads,
+            gpus: self.gpus.unwrap_or(match sweep.training.device {
+                Device::Cpu => 0.0,
+                Device::Cuda => 1.0,
+            }),
+            logs: self.out.join("slurm"),
+        })
+    }
+
+    /// Where the result of a run is written.
+    fn file(&self, run: &Run) -> PathBuf {
+        self.out.join(format!("{}.json", run.slug()))
     }
 
     /// Folder of the demonstrations that evaluations show: the same for all runs.
@@ -88,9 +156,37 @@ impl SweepCommand {
         self.out.join("shown")
     }
 
-    fn one(&self, root: &Root, sweep: &Sweep, run: &Run, recipe: Recipe) -> Result<RunResult> {
-        let started = ProcessTime::now();
+    /// Carries out a run that is not done, or goes on with it. Of several processes one does, and the others wait for it.
+    fn one(&self, root: &Root, sweep: &Sweep, run: &Run, recipe: Recipe) -> Result<()> {
         let folder = self.out.join("runs").join(run.slug());
+        let path = folder.with_extension("lock");
+        let name = || path.display().to_string();
+        std::fs::create_dir_all(self.out.join("runs")).with_context(name)?;
+        let lock = File::create(&path).with_context(name)?;
+        match lock.try_lock() {
+            Err(TryLockError::WouldBlock) => {
+                tracing::info!("another process is at it: waiting for its end");
+                lock.lock().with_context(name)?;
+            }
+            locked => locked.with_context(name)?,
+        }
+        let file = self.file(run);
+        if file.exists() {
+            return Ok(());
+        }
+        let result = self.train_and_test(root, sweep, run, recipe, &folder)?;
+        write_whole(&file, &serde_json::to_string_pretty(&result)?)
+    }
+
+    fn train_and_test(
+        &self,
+        root: &Root,
+        sweep: &Sweep,
+        run: &Run,
+        recipe: Recipe,
+        folder: &Path,
+    ) -> Result<RunResult> {
+        let started = ProcessTime::now();
         let resume = folder.join("state.safetensors").exists();
         let snapshots = train(
             root,
@@ -99,7 +195,7 @@ impl SweepCommand {
                 demos: std::slice::from_ref(&self.demos),
                 held_out: &[],
             },
-            &folder,
+            folder,
             &self.shown(),
             resume,
         )?;

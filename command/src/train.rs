@@ -221,7 +221,7 @@ pub fn train(
     }
     let mut training = Training::open(recipe, data, out, resume)?;
     let log = out.join("snapshots.jsonl");
-    let mut snapshots = read_log(&log, training.step())?;
+    let mut snapshots = resume_log(&log, training.step())?;
     let board = out.join("tensorboard");
     let written = || board.display().to_string();
     let mut events = EventFile::create(&board).with_context(written)?;
@@ -270,8 +270,8 @@ pub fn train(
             let mut snapshot = Snapshot {
                 step: training.step(),
                 checkpoint,
-                pick_loss: pick / f64::from(count),
-                place_loss: place / f64::from(count),
+                pick_loss: rounded(pick / f64::from(count)),
+                place_loss: rounded(place / f64::from(count)),
                 completion: BTreeMap::new(),
                 reward: BTreeMap::new(),
             };
@@ -296,6 +296,8 @@ pub fn train(
             }
             append(&log, &snapshot)?;
             snapshots.push(snapshot);
+            // Last: a training that is killed before this goes on from the snapshot before, and validates this one again.
+            training.save_state()?;
         }
     }
     bar.finish_and_clear();
@@ -353,23 +355,33 @@ fn validate(root: &Root, recipe: &Recipe, shown: &Path, snapshot: &mut Snapshot)
         )?;
         tracing::info!("step {}: {}", snapshot.step, summary(&report));
         snapshot.completion.insert(name.clone(), report.completion);
-        snapshot.reward.insert(name.clone(), report.reward);
+        snapshot.reward.insert(name.clone(), rounded(report.reward));
     }
     gctn::set_threads(recipe.training.threads);
     Ok(())
 }
 
-/// Snapshots of an earlier run, up to the step that it stopped at.
-fn read_log(path: &Path, step: u64) -> Result<Vec<Snapshot>> {
-    if step == 0 || !path.exists() {
+/// To 1e-6: numbers of few digits are read back from JSON bit for bit.
+fn rounded(value: f64) -> f64 {
+    (1e6 * value).round() / 1e6
+}
+
+/// The snapshots of a training that goes on after `step`. Later ones are taken again: they are removed from the log, as is a line that
+/// was not written to its end.
+fn resume_log(path: &Path, step: u64) -> Result<Vec<Snapshot>> {
+    let what = || path.display().to_string();
+    if !path.exists() {
         return Ok(Vec::new());
     }
-    let text = std::fs::read_to_string(path).with_context(|| path.display().to_string())?;
-    let snapshots = text.lines().map(|line| {
-        serde_json::from_str::<Snapshot>(line).with_context(|| path.display().to_string())
-    });
-    let mut snapshots = snapshots.collect::<Result<Vec<_>>>()?;
+    let text = std::fs::read_to_string(path).with_context(what)?;
+    let whole = text.rsplit_once('\n').map_or("", |(whole, _)| whole);
+    let snapshots = whole.lines().map(serde_json::from_str::<Snapshot>);
+    let mut snapshots: Vec<_> = snapshots.collect::<Result<_, _>>().with_context(what)?;
     snapshots.retain(|snapshot| snapshot.step <= step);
+    std::fs::remove_file(path).with_context(what)?;
+    for snapshot in &snapshots {
+        append(path, snapshot)?;
+    }
     Ok(snapshots)
 }
 
@@ -379,6 +391,42 @@ fn append(path: &Path, snapshot: &Snapshot) -> Result<()> {
         .append(true)
         .open(path);
     let mut file = open.with_context(|| path.display().to_string())?;
-    writeln!(file, "{}", serde_json::to_string(snapshot)?)
+    let line = serde_json::to_string(snapshot)? + "\n";
+    file.write_all(line.as_bytes())
         .with_context(|| path.display().to_string())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_resumed_log_has_the_snapshots_before_the_state_alone() {
+        let folder = tempfile::tempdir().unwrap();
+        let log = folder.path().join("snapshots.jsonl");
+        for step in [2, 4] {
+            let snapshot = Snapshot {
+                step,
+                checkpoint: PathBuf::new(),
+                pick_loss: 0.1,
+                place_loss: 0.2,
+                completion: BTreeMap::new(),
+                reward: BTreeMap::new(),
+            };
+            append(&log, &snapshot).unwrap();
+        }
+        let whole = std::fs::read_to_string(&log).unwrap();
+        // Killed after the line of step 4, before its state; and in the middle of a line.
+        std::fs::write(&log, whole.clone() + "{\"step\": 6, \"che").unwrap();
+        let steps = |snapshots: Vec<Snapshot>| {
+            let steps = snapshots.iter().map(|snapshot| snapshot.step);
+            steps.collect::<Vec<_>>()
+        };
+        assert_eq!(steps(resume_log(&log, 2).unwrap()), [2]);
+        let left = std::fs::read_to_string(&log).unwrap();
+        assert_eq!(left.lines().next(), whole.lines().next());
+        assert_eq!(left.lines().count(), 1);
+        assert_eq!(steps(resume_log(&log, 0).unwrap()), [0u64; 0]);
+        assert!(!log.exists());
+    }
 }

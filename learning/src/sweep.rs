@@ -241,9 +241,24 @@ impl Sweep {
 mod tests {
     use super::*;
 
+    fn load(name: &str) -> Sweep {
+        let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../config/sweeps");
+        Sweep::load(&folder.join(name)).unwrap()
+    }
+
     fn shipped() -> Sweep {
-        let path = "../config/sweeps/paper.yaml";
-        Sweep::load(&Path::new(env!("CARGO_MANIFEST_DIR")).join(path)).unwrap()
+        load("paper.yaml")
+    }
+
+    #[test]
+    fn gctn_and_sctn_have_68_cells_of_the_papers_tables() {
+        let runs = ["tables.yaml", "tables_1000.yaml"].map(|name| {
+            let runs = load(name).runs(|problem| problem.split('_').count());
+            runs.iter().map(Run::slug).collect::<Vec<_>>()
+        });
+        assert_eq!(runs.each_ref().map(Vec::len), [60, 8]);
+        assert!(runs[0].contains(&"stacking_routing-sctn_unif_step-1-0".to_owned()));
+        assert!(runs[1].contains(&"routing-sctn_step-1000-0".to_owned()));
     }
 
     #[test]

@@ -211,16 +211,20 @@ impl Training {
             .any(|step| step == self.step())
     }
 
-    /// Writes a snapshot and the state to go on from; gives the snapshot's path.
+    /// Writes a snapshot; gives its path. [`Training::save_state`] follows once what is to be known of the snapshot is kept.
     pub fn save_snapshot(&self, card: &ModelCard) -> Result<PathBuf, TrainingError> {
         let path = self
             .directory
             .join("snapshots")
             .join(format!("{:07}.safetensors", self.step()));
         self.trainer.save_checkpoint(&path, Storage::F16, card)?;
-        self.trainer
-            .save_state(&self.directory.join("state.safetensors"))?;
         Ok(path)
+    }
+
+    /// Writes the state that [`Training::open`] resumes.
+    pub fn save_state(&self) -> Result<(), TrainingError> {
+        let path = self.directory.join("state.safetensors");
+        Ok(self.trainer.save_state(&path)?)
     }
 }
 
@@ -322,6 +326,7 @@ mod tests {
             training.advance().unwrap();
             if training.is_snapshot_due() {
                 snapshot = Some(training.save_snapshot(&ModelCard::new()).unwrap());
+                training.save_state().unwrap();
             }
             if stop.take_if(|step| *step == training.step()).is_some() {
                 // The steps since the last snapshot are lost, and done again.
@@ -377,7 +382,7 @@ mod tests {
         let folder = tempfile::tempdir().unwrap();
         let mut training = Training::open(recipe(0), data(), folder.path(), false).unwrap();
         training.advance().unwrap();
-        training.save_snapshot(&ModelCard::new()).unwrap();
+        training.save_state().unwrap();
         let error = Training::open(recipe(0), data(), folder.path(), false).unwrap_err();
         assert!(error.to_string().contains("resume"), "{error}");
     }

@@ -30,6 +30,8 @@ const MOST_TAKEN_OF_FINE_TURNS: f64 = 8.0;
 const UNLIKE_FINE: f64 = 0.2;
 /// They take nothing from candidates where the best one differs by more than this: what is moved has no shape of its own, or hides.
 const UNLIKE: f64 = 0.1;
+/// A candidate stands on the lowest of what is so many cells around it, 62 mm.
+const AROUND_CELLS: usize = 10;
 /// Heights count down to this below what is compared, and up to this above it (of 40 mm).
 const DEEPEST: f64 = 0.5;
 /// Every so manyth rotation is tried.
@@ -177,10 +179,16 @@ fn sum(x: &Tensor) -> Tensor {
     x.sum_dim_intlist([1].as_slice(), true, None::<Kind>)
 }
 
-/// The highest height within a cell of the grid of this cell, by cells of this fineness. `image` is that of one sample.
-fn top_height(image: &Tensor, grid: &Grid, row: usize, col: usize, fineness: Fineness) -> Tensor {
+/// Heights within so many cells of the grid of this cell, by cells of this fineness. `image` is that of one sample.
+fn heights_around(
+    image: &Tensor,
+    grid: &Grid,
+    (row, col): (usize, usize),
+    reach: usize,
+    fineness: Fineness,
+) -> Tensor {
     let around = |at: usize, len: usize| {
-        let (first, end) = (at.max(1) - 1, (at + 2).min(len));
+        let (first, end) = (at.saturating_sub(reach), (at + reach + 1).min(len));
         (FINE * first as i64, FINE * (end - first) as i64)
     };
     let ((row, rows), (col, cols)) = (around(row, grid.rows), around(col, grid.cols));
@@ -188,7 +196,12 @@ fn top_height(image: &Tensor, grid: &Grid, row: usize, col: usize, fineness: Fin
         .narrow(1, 3, 1)
         .narrow(2, row, rows)
         .narrow(3, col, cols);
-    fineness.of(&heights).max()
+    fineness.of(&heights)
+}
+
+/// The highest height within a cell of the grid of this cell, by cells of this fineness. `image` is that of one sample.
+fn top_height(image: &Tensor, grid: &Grid, cell: (usize, usize), fineness: Fineness) -> Tensor {
+    heights_around(image, grid, cell, 1, fineness).max()
 }
 
 /// Colours, heights above `top` and where a square is inside its image; what is outside is 0.
@@ -217,8 +230,7 @@ fn shape_key(model: &Compared<'_>, sample: i64, crop: &Crop, fineness: Fineness)
         .to_kind(shown.kind());
     let around = appeared.max_pool2d([2 * reach + 1; 2], [1, 1], [0, 0], [1, 1], false);
     let inner = |x: &Tensor| x.narrow(2, reach, edge).narrow(3, reach, edge);
-    let (row, col) = (crop.place / grid.cols, crop.place % grid.cols);
-    let top = top_height(&shown, grid, row, col, fineness);
+    let top = top_height(&shown, grid, grid.row_and_col(crop.place), fineness);
     let [color, height, inside] = relative(&inner(&shown_square), &top);
     let (appeared, around) = (inner(&appeared), around * inside);
     let squares = &appeared * sum(&color.square()) + &around * height.square();
@@ -253,8 +265,8 @@ fn shape_windows(
         let first = center.map(|at| at.floor() as i64 - reach);
         let square = fineness.square(&seen, [first.y, first.x], 2 * (reach + 1));
         let nearest = |at: f64, len: usize| at.round().clamp(0.0, (len - 1) as f64) as usize;
-        let (row, col) = (nearest(point.y, grid.rows), nearest(point.x, grid.cols));
-        let top = top_height(&seen, grid, row, col, fineness);
+        let cell = (nearest(point.y, grid.rows), nearest(point.x, grid.cols));
+        let top = top_height(&seen, grid, cell, fineness);
         (square, top, center - first.map(|at| at as f64).coords)
     });
     let (mut seen, mut tops, mut centers) = (Vec::new(), Vec::new(), Vec::new());
@@ -294,6 +306,28 @@ fn shape_difference(
     strided(&key.narrow(1, 0, 7), &windows, factor) / area
 }
 
+/// Minus half the squared difference (of 40 mm each) between how high each candidate stands above the lowest cell around it and how high
+/// v_k has risen at the place: one a candidate. The cells that shapes are compared by end 20 mm below the top of a thing.
+fn height_difference(
+    model: &Compared<'_>,
+    sample: i64,
+    candidates: &[usize],
+    place: usize,
+) -> Tensor {
+    let (grid, [seen, before, shown]) = (model.grid, model.cells(sample));
+    let top = |image: &Tensor, cell: usize| {
+        top_height(image, grid, grid.row_and_col(cell), Fineness::Grid)
+    };
+    let stand = |cell: &usize| {
+        let around = grid.row_and_col(*cell);
+        let around = heights_around(&seen, grid, around, AROUND_CELLS, Fineness::Grid);
+        top(&seen, *cell) - around.min()
+    };
+    let stand: Vec<Tensor> = candidates.iter().map(stand).collect();
+    let risen = top(&shown, place) - top(&before, place);
+    (Tensor::stack(&stand, 0) - risen).square() * -0.5
+}
+
 /// What differences of cells take from logits: weighted, and beyond that of what fits best.
 fn taken(differences: &Tensor, weight: f64, at_most: f64) -> Tensor {
     ((differences - differences.max()) * weight).clamp_min(-at_most)
@@ -322,7 +356,12 @@ fn fits(model: &Compared<'_>, sample: i64, candidates: &[usize], place: usize) -
     let differences = best_of_each(&differences, candidates);
     // A cable has another shape wherever it lies.
     let is_like = differences.max().gt(-UNLIKE).to_kind(learned.kind());
-    learned + taken(&differences, model.pick_shape_weight, MOST_TAKEN) * is_like
+    let mut shapes = taken(&differences, model.pick_shape_weight, MOST_TAKEN);
+    if model.pick_height_weight > 0.0 {
+        let differences = height_difference(model, sample, candidates, place);
+        shapes += taken(&differences, model.pick_height_weight, MOST_TAKEN);
+    }
+    learned + shapes * is_like
 }
 
 /// What a network says that compares candidates, and how.
@@ -334,13 +373,14 @@ struct Compared<'a> {
     rotations: usize,
     shape_weight: f64,
     pick_shape_weight: f64,
+    pick_height_weight: f64,
     fine_shapes: bool,
 }
 
 impl<'a> Compared<'a> {
     fn new(grid: &'a Grid, features: &'a Features, config: &NetworkConfig) -> Option<Self> {
         let first = features.first.as_ref()?;
-        let [shape_weight, pick_shape_weight] = config.shape_weights();
+        let [shape_weight, pick_shape_weight, pick_height_weight] = config.shape_weights();
         let fine_shapes = config.has_fine_shapes();
         Some(Self {
             grid,
@@ -350,6 +390,7 @@ impl<'a> Compared<'a> {
             rotations: config.rotations,
             shape_weight,
             pick_shape_weight,
+            pick_height_weight,
             fine_shapes,
         })
     }
@@ -462,7 +503,7 @@ pub(crate) fn turn_shapes(
             let within = |at: usize, begin: i64| {
                 (at as i64 - begin - 1).clamp(0, Crop::places(grid, crop.edge) - 3)
             };
-            let (row, col) = (place / grid.cols, place % grid.cols);
+            let (row, col) = grid.row_and_col(place);
             let around =
                 added
                     .narrow(1, within(row, crop.row), 3)
@@ -659,6 +700,43 @@ mod tests {
         assert!(picked(1.0, 20.0), "the cells' say");
         // More than the cells may take.
         assert!(!picked(2.0 * MOST_TAKEN, 1000.0));
+    }
+
+    #[test]
+    fn of_squares_of_one_size_the_one_of_the_shown_height_is_picked() {
+        // Cuboids of 58 and 50 mm: the shapes end 20 mm below their tops.
+        let high = |height: f64, square| doubled(&(squares(&[square]) * height));
+        let seen = high(1.25, (10, 10, 5)) + high(1.45, (10, 28, 5));
+        let picked = |shown: f64, weight: f64| {
+            let mut features = features(&[(10, 10, 5), (10, 28, 5)], (45, 22, 5));
+            let fit = features.first.as_mut().and_then(|first| first.fit.as_mut());
+            let fit = fit.unwrap();
+            let shown = high(shown, (45, 22, 5));
+            // Only heights: the cells have no colour.
+            let heights = |image: Tensor| {
+                Tensor::cat(
+                    &[image.narrow(1, 0, 3).zeros_like(), image.narrow(1, 3, 1)],
+                    1,
+                )
+            };
+            fit.cells = [seen.shallow_clone(), seen.zeros_like(), shown].map(heights);
+            fit.key = fit.key.zeros_like();
+            features.pick *= 0.1;
+            let mut second = features.pick.get(0).get(10).get(28);
+            let _ = second.g_add_scalar_(0.5);
+            let mut config = config(6, [0.0, 20.0]);
+            if let Network::Matching(matching) = &mut config.network {
+                matching.pick_height_weight = weight;
+            }
+            let mut logits = values(&features.pick, "the pick map").unwrap();
+            add_fits(&GRID, &features, &config, &mut logits).unwrap();
+            let best =
+                (0..logits.len()).max_by(|one, other| logits[*one].total_cmp(&logits[*other]));
+            best.unwrap() % GRID.cols
+        };
+        assert!(picked(1.25, 0.0) > 20, "the pick map's say");
+        assert!(picked(1.25, 100.0) < 20, "the heights' say");
+        assert!(picked(1.45, 100.0) > 20);
     }
 
     /// A square of so many cells of the heightmap along its edge, turned about a point of the grid: 1 x 4 x rows x cols of the heightmap.

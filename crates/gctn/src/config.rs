@@ -206,6 +206,10 @@ pub struct Matching {
     /// no candidate is like what was moved. 0: nothing.
     #[serde(skip_serializing_if = "is_nothing")]
     pub pick_shape_weight: f64,
+    /// Weight of how high candidates stand above what is around them, against how high v_k has risen at the place: half the squared
+    /// difference, in 40 mm. It takes at most 2 from a logit, where `pick_shape_weight` takes something. 0: nothing.
+    #[serde(skip_serializing_if = "is_nothing")]
+    pub pick_height_weight: f64,
     /// Whether turns are compared by the cells of the heightmap in place of those of stride 2: small things show no turn in these. A
     /// larger `shape_weight` is right then.
     #[serde(skip_serializing_if = "is_false")]
@@ -228,6 +232,7 @@ impl Default for Matching {
             candidates: 0,
             shape_weight: 0.0,
             pick_shape_weight: 0.0,
+            pick_height_weight: 0.0,
             fine_shapes: false,
             window_cells: 21,
             rotation_sampling: Interpolation::Bilinear,
@@ -394,11 +399,16 @@ impl NetworkConfig {
                 for (what, weight) in [
                     ("shape_weight", matching.shape_weight),
                     ("pick_shape_weight", matching.pick_shape_weight),
+                    ("pick_height_weight", matching.pick_height_weight),
                 ] {
                     let good =
                         (0.0..=1e3).contains(&weight) && (weight == 0.0 || matching.candidates > 0);
                     check(what, good, weight, "0 to 1000, and 0 without candidates")?;
                 }
+                let weight = matching.pick_height_weight;
+                let good = weight == 0.0 || matching.pick_shape_weight > 0.0;
+                let expected = "0 without a pick_shape_weight";
+                check("pick_height_weight", good, weight, expected)?;
                 heads(matching.feature_channels, matching.window_cells)
             }
         }
@@ -412,11 +422,15 @@ impl NetworkConfig {
         }
     }
 
-    /// Weights of the cells themselves in comparing turns, and in comparing candidates.
-    pub(crate) fn shape_weights(&self) -> [f64; 2] {
+    /// Weights of the cells themselves in comparing turns, and of shapes and heights in comparing candidates.
+    pub(crate) fn shape_weights(&self) -> [f64; 3] {
         match &self.network {
-            Network::Matching(matching) => [matching.shape_weight, matching.pick_shape_weight],
-            Network::Compact(_) | Network::GrConvnet(_) | Network::Resnet43(_) => [0.0; 2],
+            Network::Matching(matching) => [
+                matching.shape_weight,
+                matching.pick_shape_weight,
+                matching.pick_height_weight,
+            ],
+            Network::Compact(_) | Network::GrConvnet(_) | Network::Resnet43(_) => [0.0; 3],
         }
     }
 
@@ -433,6 +447,7 @@ impl NetworkConfig {
                 matching.candidates = 0;
                 matching.shape_weight = 0.0;
                 matching.pick_shape_weight = 0.0;
+                matching.pick_height_weight = 0.0;
                 matching.fine_shapes = false;
             }
             config

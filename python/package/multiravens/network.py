@@ -46,6 +46,7 @@ _DEFAULTS: dict[str, dict[str, Any]] = {
         "candidates": 0,
         "shape_weight": 0.0,
         "pick_shape_weight": 0.0,
+        "pick_height_weight": 0.0,
         "fine_shapes": False,
         "window_cells": 21,
         "rotation_sampling": "bilinear",
@@ -57,6 +58,8 @@ _COLOR, _HEIGHT_M = (0.18877631, 0.07276466), (0.00509261, 0.00903967)
 # Candidates for the pick are more than so many cells apart; a window is looked for in so many cells around the place; every so
 # manyth rotation is tried.
 _APART_CELLS, _SHIFT_CELLS, _TURN_STRIDE = 4.0, 3, 2
+# A candidate stands on the lowest of what is so many cells around it.
+_AROUND_CELLS = 10
 # The cells themselves take at most so much from the logit of a candidate, and of a turn. They take nothing from candidates where the
 # best one differs by more than this. Heights count down to this below what is compared, and up to this above it (of 40 mm).
 _MOST_TAKEN, _MOST_TAKEN_OF_TURNS, _UNLIKE, _DEEPEST = 2.0, 4.0, 0.1, 0.5
@@ -379,14 +382,35 @@ class Network(nn.Module):
         return logits + added
 
     def _taken(self, features: Features, peaks: Sequence[tuple[int, int]]) -> torch.Tensor:
-        """What the cells themselves take from the logit of each candidate: their weighted difference beyond that of the candidate that
-        fits best."""
+        """What the cells themselves take from the logit of each candidate: the weighted difference of its shape, and of its height,
+        beyond that of the candidate that fits best."""
         differences = self._shape_difference(features, [[col, row] for row, col in peaks], _TURN_STRIDE, False).amax((1, 2, 3))
         # A cable has another shape wherever it lies.
         if differences.max() <= -_UNLIKE:
             return torch.zeros_like(differences)
-        taken = self.config["network"]["pick_shape_weight"] * (differences - differences.max())
-        return taken.clamp_min(-_MOST_TAKEN)
+        network = self.config["network"]
+
+        def beyond(weight: float, differences: torch.Tensor) -> torch.Tensor:
+            return (weight * (differences - differences.max())).clamp_min(-_MOST_TAKEN)
+
+        taken = beyond(network["pick_shape_weight"], differences)
+        if network["pick_height_weight"] > 0:
+            taken = taken + beyond(network["pick_height_weight"], self._height_difference(features, peaks))
+        return taken
+
+    def _height_difference(self, features: Features, peaks: Sequence[tuple[int, int]]) -> torch.Tensor:
+        """Minus half the squared difference (of 40 mm each) between how high each candidate stands above the lowest cell around it and
+        how high the goal has risen at the place."""
+        assert features.place is not None and features.cells is not None
+
+        def around(image: torch.Tensor, row: int, col: int, reach: int) -> torch.Tensor:
+            return image[3, max(row - reach, 0) : row + reach + 1, max(col - reach, 0) : col + reach + 1]
+
+        seen, before, shown = features.cells
+        place = divmod(int(features.place.argmax()), self.grid[1])
+        risen = around(shown, *place, 1).max() - around(before, *place, 1).max()
+        stand = [around(seen, *peak, 1).max() - around(seen, *peak, _AROUND_CELLS).min() for peak in peaks]
+        return (torch.stack(stand) - risen).square() / -2
 
     def add_fits(self, features: Features, picks: Any) -> Any:
         """Logits of picks (rows x cols, numpy) with how well their highest peaks fit what is to be placed: cells around a peak

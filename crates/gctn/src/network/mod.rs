@@ -118,6 +118,11 @@ impl Grid {
     pub fn coordinate_px(&self, index: f64) -> f64 {
         (index + 0.5) * self.stride as f64
     }
+
+    /// Row and column of a cell, which count row by row.
+    pub fn row_and_col(&self, cell: usize) -> (usize, usize) {
+        (cell / self.cols, cell % self.cols)
+    }
 }
 
 #[derive(Debug)]

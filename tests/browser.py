@@ -10,7 +10,7 @@ from contextlib import contextmanager
 
 import pytest
 from axe_playwright_python.sync_playwright import Axe
-from playwright.sync_api import Browser, BrowserType, Locator, Page, expect, sync_playwright
+from playwright.sync_api import Browser, BrowserType, Locator, Page, ViewportSize, expect, sync_playwright
 from processes import Process
 
 CHROMIUM = next((found for name in ("chromium", "chromium-browser", "google-chrome") if (found := shutil.which(name))), None)
@@ -53,14 +53,22 @@ def address_of(launch: Process, until: Callable[[Callable[[], object], str, floa
     return until(printed, "address of the operator's page", 90.0)
 
 
+# Of a telephone.
+NARROW = ViewportSize(width=390, height=844)
+
+
 def no_barrier(page: Page) -> None:
-    """axe-core finds nothing serious: names, roles, contrast, focus. Nothing has to be scrolled sideways."""
-    found = Axe().run(page).response["violations"]
-    serious = [(one["id"], [node["html"] for node in one["nodes"]]) for one in found if one["impact"] in ("serious", "critical")]
-    if serious:
-        raise AssertionError(f"axe-core finds: {serious}")
-    wide = page.evaluate("[document.documentElement.scrollWidth, document.documentElement.clientWidth]")
-    assert wide[0] <= wide[1], f"the page is {wide[0]} px wide, of which {wide[1]} are seen"
+    """axe-core finds nothing serious: names, roles, contrast, focus. Nothing has to be scrolled sideways. On a telephone neither."""
+    size = page.viewport_size
+    assert size is not None
+    for seen in (NARROW, size):
+        page.set_viewport_size(seen)
+        found = Axe().run(page).response["violations"]
+        serious = [(one["id"], [node["html"] for node in one["nodes"]]) for one in found if one["impact"] in ("serious", "critical")]
+        if serious:
+            raise AssertionError(f"axe-core finds at {seen['width']} px: {serious}")
+        wide = page.evaluate("[document.documentElement.scrollWidth, document.documentElement.clientWidth]")
+        assert wide[0] <= wide[1], f"the page is {wide[0]} px wide, of which {wide[1]} are seen"
 
 
 class Person:

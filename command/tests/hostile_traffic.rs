@@ -4,8 +4,10 @@ use anyhow::{Context as _, Result, ensure};
 use msgs::sctn_msgs::{Goal, Heightmap, PickPlace, StepConfirmation, StepResult};
 use msgs::std_msgs::Bool;
 use msgs::ur_dashboard_msgs::{RobotMode, SafetyMode};
+use msgs::ur_msgs::{SetIO, SetIORequest};
 use node_kit::{
-    AsBytes, Context, Network, NoParameters, Publisher, Qos, RosArguments, Subscription,
+    AsBytes, CallOptions, Context, Network, NoParameters, Publisher, Qos, RosArguments,
+    Subscription,
 };
 use rand::{Rng, RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
@@ -332,6 +334,21 @@ async fn hostile_traffic_on_every_topic_and_service_ends_no_node() -> Result<()>
         Ok(nodes)
     });
     let _nodes = attacked.await??;
+
+    // Calls are answered in the order of their arrival: once this one is, the driver has done with the garbage. That may have
+    // switched the tool's voltage off.
+    let set_io = node.service_client::<SetIO>(&driver("set_io"))?;
+    let voltage = SetIORequest {
+        fun: SetIORequest::FUN_SET_TOOL_VOLTAGE,
+        pin: 0,
+        state: 24.0,
+    };
+    let options = CallOptions {
+        attempts: PATIENCE.as_secs() as u32,
+        ..CallOptions::default()
+    };
+    let answer = within("tool voltage", set_io.call(&voltage, &options)).await??;
+    ensure!(answer.success, "the driver refuses the tool's voltage");
 
     // Garbage that can be read was the driver's state, a call of `propose_home` and a proposal in the place of the
     // one that was there. What is true is said again, and the run goes on from where it was; topics are

@@ -53,6 +53,14 @@ def address_of(launch: Process, until: Callable[[Callable[[], object], str, floa
     return until(printed, "address of the operator's page", 90.0)
 
 
+# What sticks out on the right, where the page would have to be scrolled sideways.
+OUTSIDE = """() => {
+    const { scrollWidth, clientWidth } = document.documentElement;
+    if (scrollWidth <= clientWidth) return [];
+    const sticksOut = (one) => one.getBoundingClientRect().right > clientWidth;
+    const found = [...document.querySelectorAll("body *")].filter(sticksOut);
+    return [`the page by ${scrollWidth - clientWidth} px`, ...found.map((one) => one.outerHTML.slice(0, 120))];
+}"""
 # Of a telephone.
 NARROW = ViewportSize(width=390, height=844)
 
@@ -67,8 +75,8 @@ def no_barrier(page: Page) -> None:
         serious = [(one["id"], [node["html"] for node in one["nodes"]]) for one in found if one["impact"] in ("serious", "critical")]
         if serious:
             raise AssertionError(f"axe-core finds at {seen['width']} px: {serious}")
-        wide = page.evaluate("[document.documentElement.scrollWidth, document.documentElement.clientWidth]")
-        assert wide[0] <= wide[1], f"the page is {wide[0]} px wide, of which {wide[1]} are seen"
+        outside = page.evaluate(OUTSIDE)
+        assert not outside, f"at {seen['width']} px these stick out: {outside}"
 
 
 class Person:

@@ -77,7 +77,14 @@ def test_a_person_at_the_terminal_rejects_approves_stops_and_calls_the_arm_home(
     # A step that was carried out is asked about, without a reward.
     proposal = terminal.offered()
     terminal.says("y")
-    assert ended(terminal, after, proposal.id).outcome == StepResult.GRASP_FAILED
+    result = ended(terminal, after, proposal.id)
+    if result.outcome == StepResult.REFUSED:
+        # The newest view may be of a moment before the motion had ended.
+        assert "before the last motion ended" in result.reason
+        proposal = terminal.offered()
+        terminal.says("y")
+        result = ended(terminal, after, proposal.id)
+    assert result.outcome == StepResult.GRASP_FAILED, result
     terminal.shows("did the step succeed?")
     terminal.says("n")
     operator.until(lambda: decided and decided[-1].decision == StepConfirmation.RETRY, "RETRY", 30.0)

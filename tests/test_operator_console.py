@@ -822,11 +822,13 @@ def test_hostile_input_moves_nothing_and_the_page_works_on(start, decided) -> No
     generator = random.Random(7)
     token = url.fragment.removeprefix("token=")
 
-    def send(data: bytes) -> bytes:
+    def send(data: bytes, ends: bool = True) -> bytes:
         with socket.create_connection((url.hostname, url.port), timeout=5) as connection:
             try:
                 connection.sendall(data)
-                connection.shutdown(socket.SHUT_WR)
+                # A server may leave a request unanswered whose client has ended.
+                if ends:
+                    connection.shutdown(socket.SHUT_WR)
                 return connection.recv(65536)
             except OSError:
                 # It was cut off.
@@ -852,7 +854,7 @@ def test_hostile_input_moves_nothing_and_the_page_works_on(start, decided) -> No
     # A page of another site is refused, token and all, on the WebSocket too.
     for path, more in (("state", b""), ("live", b"Connection: Upgrade\r\nUpgrade: websocket\r\n")):
         foreign = f"GET /api/v1/{path} HTTP/1.1\r\n".encode() + host + b"Origin: http://evil.example\r\n" + more
-        answer = send(foreign + b"Authorization: Bearer " + token.encode() + b"\r\n\r\n")
+        answer = send(foreign + b"Authorization: Bearer " + token.encode() + b"\r\n\r\n", ends=False)
         assert answer.startswith(b"HTTP/1.1 403"), answer
     with pytest.raises(CLIENT.Refused) as wrong:
         CLIENT.Console(address.replace(token, "0" * len(token)), "Eve")

@@ -16,8 +16,8 @@ mod types;
 mod tests;
 
 pub use gate::{
-    ApprovalGate, GateAction, GateRules, InvalidProposal, JointPositions, Proposed, Refusal,
-    Report, RequireApproval, RobotState,
+    AT_REST_RAD, ApprovalGate, CannotBegin, GateAction, GateRules, InvalidProposal, JointPositions,
+    Proposed, Recovery, Refusal, Report, RequireApproval, RobotState,
 };
 pub use goals::{
     FAILED_PICK_RADIUS_M, FailedPicks, GoalSequence, Judgement, NoGoals, ReachedGoals, ShownStep,

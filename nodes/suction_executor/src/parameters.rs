@@ -36,7 +36,7 @@ pub struct SuctionExecutorParameters {
     pub observation_max_age_s: f64,
     /// Whether heightmaps count only where the arm was at home and at rest when they were taken.
     pub observation_needs_home: bool,
-    /// Distance that the way home keeps from the cell and from what was seen (m).
+    /// Distance that the arm keeps from the cell and from what was seen (m).
     pub collision_margin_m: f64,
     /// Wall seconds that a confirmation waits for its proposal and heightmap.
     pub confirmation_grace_s: f64,
@@ -185,6 +185,7 @@ impl Parameters for SuctionExecutorParameters {
         ("contact.press_m", Range::Float(0.0, 0.01)),
         ("driver.suction_pin", PIN),
         ("driver.vacuum_pin", PIN),
+        ("driver.enable_pin", Range::Integer(-1, 17)),
         ("driver.status_max_age_s", TIME),
         ("driver.reading_timeout_s", TIME),
         ("driver.rest_speed_rad_s", Range::POSITIVE),

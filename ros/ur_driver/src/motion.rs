@@ -186,12 +186,16 @@ impl DriverClient {
         let margin = Duration::from_secs_f64(motion_time_margin_s);
         let limit = planned.mul_f64(motion_time_factor) + margin;
         let begin_ns = self.clock.now_ns();
+        let since = self.origin.elapsed();
         let mut ticks = interval(WATCH_PERIOD);
         ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
         loop {
             tokio::select! {
                 () = stop.cancelled() => return DriverError::Stopped,
                 _ = ticks.tick() => {}
+            }
+            if self.is_disabled_since(since) {
+                return DriverError::Stopped;
             }
             if let Some(obstacle) = self.obstacle() {
                 return DriverError::Fault(obstacle);

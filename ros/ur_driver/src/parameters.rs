@@ -29,6 +29,8 @@ pub struct DriverParameters {
     pub suction_pin: u8,
     /// Digital input of the vacuum sensor.
     pub vacuum_pin: u8,
+    /// Digital input without which nothing moves: low in a motion is a stop; -1 for none.
+    pub enable_pin: i8,
     /// Wall seconds; nothing moves when joint or pin states are older.
     pub status_max_age_s: f64,
     /// Wall seconds to wait for a fresh state of the joints or pins.
@@ -79,6 +81,7 @@ impl Default for DriverParameters {
             io_and_status: "io_and_status_controller".into(),
             suction_pin: 16,
             vacuum_pin: 16,
+            enable_pin: -1,
             status_max_age_s: 2.0,
             reading_timeout_s: 5.0,
             rest_speed_rad_s: 1e-3,

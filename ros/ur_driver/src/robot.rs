@@ -48,7 +48,7 @@ impl DriverRobot {
 
     /// Refuses to go on where it must not.
     fn check(&self) -> Result<(), DriverError> {
-        if self.stop.is_cancelled() {
+        if self.stop.is_cancelled() || self.client.is_disabled_since(self.begun) {
             return Err(DriverError::Stopped);
         }
         if let Some(obstacle) = self.client.obstacle() {

@@ -29,6 +29,7 @@ impl Executor<'_> {
             (None, Some(motion)) => Some(match motion.cause {
                 Cause::Proposal(moving) => format!("proposal {moving} is being carried out"),
                 Cause::Home(_) => "the arm is on its way home".to_owned(),
+                Cause::PutDown(_) => "what is held is being put down".to_owned(),
             }),
             (None, None) => None,
         };
@@ -36,9 +37,9 @@ impl Executor<'_> {
             Some(busy) => Err(busy),
             None => {
                 let proposal = read_proposal(&new.goal.proposal);
-                let proposed = self.gate.on_proposal(id, proposal.clone());
+                let proposed = self.gate.on_proposal(id, proposal);
                 if matches!(proposed, Proposed::Pending) {
-                    self.show_plan(proposal.ok());
+                    self.rehearse_next();
                 }
                 match proposed {
                     Proposed::Invalid(reason) => Err(reason.to_string()),

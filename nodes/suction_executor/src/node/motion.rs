@@ -5,19 +5,17 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use anyhow::Context as _;
-use msgs::sctn_msgs::ProposeHomeResponse;
-use node_kit::{Level, RequestId};
-use pick_place::{ExecuteError, Outcome, Phase, go_home};
-use step_protocol::{OperatorDecision, Proposal, ProposalId, Report, StepOutcome};
+use node_kit::Level;
+use pick_place::{ExecuteError, Outcome, Phase, go_home, put_down};
+use step_protocol::{Proposal, ProposalId, Report, StepOutcome};
 use tokio::runtime::Handle;
 use tokio::task::JoinHandle;
 use tokio_util::sync::CancellationToken;
-use tracing::{info, warn};
-use ur_driver::planted::{Planted, is_planted};
+use tracing::info;
 use ur_driver::{DriverError, DriverRobot};
 
 use super::Executor;
-use crate::dry_run::HOME_SETTINGS;
+use crate::dry_run::{HOME_SETTINGS, Picked};
 use crate::surface::touchdown;
 
 /// What moves the arm.
@@ -27,6 +25,8 @@ pub(super) enum Cause {
     Proposal(ProposalId),
     /// An approved way home.
     Home(ProposalId),
+    /// What is held is put down first.
+    PutDown(ProposalId),
 }
 
 /// Why a motion is stopped.
@@ -35,6 +35,7 @@ pub(super) enum StopCause {
     Operator,
     GoalCancelled,
     NobodyPresent,
+    Disabled,
     Deactivated,
     Shutdown,
 }
@@ -45,6 +46,7 @@ impl StopCause {
             Self::Operator => "stopped by the operator",
             Self::GoalCancelled => "stopped because its goal was cancelled",
             Self::NobodyPresent => "stopped because no operator is present",
+            Self::Disabled => "stopped because the enabling input was low (driver.enable_pin)",
             Self::Deactivated => "stopped because the executor was deactivated",
             Self::Shutdown => "stopped because the executor was told to end",
         }
@@ -98,7 +100,10 @@ impl Executor<'_> {
             // The receiver lives as long as the node.
             let _ = phases.send(phase);
         };
-        self.picked = Some(proposal.action.pick);
+        self.picked = seen.as_ref().map(|(seen, _)| Picked {
+            tip: proposal.action.tips().0,
+            seen: Arc::clone(seen),
+        });
         self.start(Cause::Proposal(id), move |robot| {
             let Proposal {
                 action, settings, ..
@@ -117,39 +122,8 @@ impl Executor<'_> {
         });
     }
 
-    /// Proposes the way home, for after a stop or a fault. The call may come again because its answer was lost.
-    pub(super) fn on_propose_home(&mut self, call: RequestId) {
-        let robot = self.robot();
-        let id = self.home_id();
-        let answer = match self.gate.propose_home(id, &robot) {
-            Ok(id) => {
-                info!("proposal {id}: the way home");
-                self.publish_plan(robot.dry_run_home(), id);
-                let unasked = self.gate.moves_unasked(id) || is_planted(Planted::HomeUnasked);
-                if unasked {
-                    self.confirm(id, OperatorDecision::Approve);
-                }
-                ProposeHomeResponse {
-                    success: true,
-                    message: String::new(),
-                    proposal_id: id.0,
-                    needs_approval: !unasked,
-                }
-            }
-            Err(reason) => {
-                warn!("home: {reason}");
-                ProposeHomeResponse {
-                    success: false,
-                    message: reason,
-                    ..Default::default()
-                }
-            }
-        };
-        self.home.respond(call, answer);
-    }
-
     /// An id for a way home: of the present time and place.
-    fn home_id(&self) -> ProposalId {
+    pub(super) fn home_id(&self) -> ProposalId {
         let mut hash = DefaultHasher::new();
         self.node.clock().now_ns().hash(&mut hash);
         self.origin.elapsed().hash(&mut hash);
@@ -167,6 +141,21 @@ impl Executor<'_> {
         let arm = self.work_cell.arm.clone();
         self.start(Cause::Home(id), move |robot| {
             go_home(robot, &arm, &HOME_SETTINGS).map(|()| None)
+        });
+    }
+
+    /// Puts down what is held where it was picked, and brings the arm home.
+    pub(super) fn begin_put_down(&mut self, id: ProposalId) {
+        info!("proposal {id}: putting down what is held");
+        let arm = self.work_cell.arm.clone();
+        // The gate has asked for it before.
+        let what = self.robot().put_down();
+        self.start(Cause::PutDown(id), move |robot| {
+            let what = what.map_err(|reason| ExecuteError::Robot {
+                phase: Phase::Retreat,
+                error: DriverError::Fault(reason),
+            })?;
+            put_down(robot, &arm, &what, &HOME_SETTINGS).map(|()| None)
         });
     }
 
@@ -207,13 +196,23 @@ impl Executor<'_> {
         };
         let (outcome, mut reason) = match result {
             Ok(Ok(Some(outcome))) => (StepOutcome::from(outcome), why(outcome).to_owned()),
-            Ok(Ok(None)) => (StepOutcome::AtHome, String::new()),
+            Ok(Ok(None)) => match cause {
+                Cause::PutDown(_) => (
+                    StepOutcome::AtHome,
+                    "what was held is put down where it was picked".to_owned(),
+                ),
+                Cause::Home(_) | Cause::Proposal(_) => (StepOutcome::AtHome, String::new()),
+            },
             Ok(Err(ExecuteError::Robot {
                 phase,
                 error: DriverError::Stopped,
             })) => (
                 StepOutcome::Stopped,
-                format!("{phase:?}: {}", stopped.map_or("stopped", StopCause::text)),
+                // Who else would stop it has said so.
+                format!(
+                    "{phase:?}: {}",
+                    stopped.unwrap_or(StopCause::Disabled).text()
+                ),
             ),
             Ok(Err(error)) => (StepOutcome::Fault, error.to_string()),
             Err(error) => (StepOutcome::Fault, format!("{error:#}")),
@@ -240,8 +239,8 @@ impl Executor<'_> {
         let actions = self.gate.finish(end, broken_off);
         let (id, outcome) = match cause {
             Cause::Proposal(id) => (id, outcome),
-            Cause::Home(id) if broken_off => (id, StepOutcome::NotHome),
-            Cause::Home(id) => (id, StepOutcome::AtHome),
+            Cause::Home(id) | Cause::PutDown(id) if broken_off => (id, StepOutcome::NotHome),
+            Cause::Home(id) | Cause::PutDown(id) => (id, StepOutcome::AtHome),
         };
         let report = Report {
             id,
@@ -254,6 +253,7 @@ impl Executor<'_> {
         self.plant_at_end(outcome);
         self.act(actions);
         self.ask_again();
+        self.rehearse_next();
     }
 }
 

@@ -80,6 +80,7 @@ impl Executor<'_> {
         let motion = match self.motion.as_ref().map(|motion| motion.cause) {
             None => "at rest".to_owned(),
             Some(Cause::Home(_)) => "goes home".to_owned(),
+            Some(Cause::PutDown(_)) => "puts down what is held".to_owned(),
             Some(Cause::Proposal(id)) => format!("carries out proposal {id}"),
         };
         diagnostics.set("motion", Level::Ok, motion, []);

@@ -10,4 +10,4 @@ pub use primitive::{Command, Next, Outcome, Phase, PickPlace, Primitive, Primiti
 pub use put_down::{PutDown, put_down};
 pub use robot::{ExecuteError, Robot, execute, execute_on, go_home};
 pub use settings::{PrimitiveSettings, SettingsError};
-pub use touchdown::Touchdown;
+pub use touchdown::{ContactSettings, ContactSign, Touchdown};

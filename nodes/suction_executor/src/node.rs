@@ -18,7 +18,8 @@ use heightmap::{ChangeRules, Heightmap};
 use msgs::{convert, sctn_msgs};
 use node_kit::{ActionServer, Active, Node, Publisher, Qos, ServiceServer, Subscription};
 use pick_place::Phase;
-use step_protocol::{ApprovalGate, GateRules, Recovery};
+use rehearsal::{Picked, RobotNow};
+use step_protocol::{ApprovalGate, GateRules, Presence, Recovery, StopCause};
 use tokio::sync::{mpsc, watch};
 use tokio::time::timeout_at;
 use tracing::warn;
@@ -27,11 +28,9 @@ use ur_driver::status::DriverStatus;
 use ur5::WorkCell;
 
 use self::action::{Goal, cancel_of};
-use self::motion::{Motion, StopCause, end_of};
+use self::motion::{Motion, end_of};
 use self::rehearsals::Rehearsals;
-use crate::dry_run::{Picked, RobotNow};
 use crate::parameters::SuctionExecutorParameters;
-use crate::presence::Presence;
 use crate::stop_memory::StopMemory;
 
 /// How long a motion may take to stop when the node is deactivated.
@@ -255,7 +254,8 @@ impl Executor<'_> {
     }
 
     fn on_presence(&mut self, message: &sctn_msgs::OperatorPresence) {
-        self.presence.on_message(message.is_present, Instant::now());
+        self.presence
+            .on_message(message.is_present, self.origin.elapsed());
         if self
             .absence()
             .is_some_and(|absence| absence <= Instant::now())
@@ -268,7 +268,8 @@ impl Executor<'_> {
     fn absence(&self) -> Option<Instant> {
         let motion = self.motion.as_ref()?;
         let watched = self.parameters.require_presence && !motion.is_stopped();
-        watched.then(|| self.presence.deadline().unwrap_or_else(Instant::now))
+        let deadline = self.presence.deadline();
+        watched.then(|| deadline.map_or_else(Instant::now, |deadline| self.origin + deadline))
     }
 
     fn on_absence(&mut self) {
@@ -280,7 +281,8 @@ impl Executor<'_> {
 
     /// Why nothing may begin to move: nobody is present.
     fn unattended(&self) -> Option<String> {
-        let absent = self.parameters.require_presence && !self.presence.is_present(Instant::now());
+        let absent =
+            self.parameters.require_presence && !self.presence.is_present(self.origin.elapsed());
         absent.then(|| "no operator is present (require_presence)".to_owned())
     }
 
@@ -314,13 +316,19 @@ impl Executor<'_> {
     }
 
     fn robot(&self) -> RobotNow {
+        let status = self.status.borrow();
+        let max_age = Duration::from_secs_f64(self.parameters.driver.status_max_age_s);
+        let obstacle = self
+            .unattended()
+            .or_else(|| status.obstacle(self.origin.elapsed(), max_age))
+            .or_else(|| self.driver.refusal());
         RobotNow {
             arm: self.work_cell.arm.clone(),
-            status: self.status.borrow().clone(),
-            now: self.origin.elapsed(),
-            max_age: Duration::from_secs_f64(self.parameters.driver.status_max_age_s),
-            unattended: self.unattended(),
-            refused: self.driver.refusal(),
+            checker: Arc::clone(&self.checker),
+            obstacle,
+            joints_rad: status.joints.map(|joints| joints.value.positions_rad),
+            holds: status.pins.map(|pins| pins.value.vacuum),
+            at_home: status.at_home,
             unseen: self.has_publisher && self.publishers() == 0,
             needs_home: self.parameters.observation_needs_home,
             time: Duration::from_nanos(self.node.clock().now_ns().max(0) as u64),
@@ -328,7 +336,6 @@ impl Executor<'_> {
             observation_max_age: Duration::from_secs_f64(self.parameters.observation_max_age_s),
             contact: self.parameters.contact,
             sign: self.parameters.driver.contact,
-            checker: Arc::clone(&self.checker),
             without_arm: self.without_arm.clone(),
             picked: self.picked.clone(),
             changes: changes(&self.parameters),

@@ -8,14 +8,14 @@ use std::time::{Duration, Instant};
 
 use msgs::Action;
 use node_kit::{ActionClient, CallError, CallOptions, GoalStatus, SentGoal};
+use pick_place::ContactSign;
 use tokio::sync::oneshot;
 use tokio::time::{MissedTickBehavior, interval, sleep, timeout};
 use tokio_util::sync::CancellationToken;
 use tracing::{debug, info, warn};
 
 use crate::planted::{Planted, is_planted};
-use crate::{ContactSign, DriverParameters};
-use crate::{DriverClient, DriverError};
+use crate::{DriverClient, DriverError, DriverParameters};
 
 /// How often a motion is looked after.
 const WATCH_PERIOD: Duration = Duration::from_millis(20);

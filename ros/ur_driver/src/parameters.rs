@@ -1,19 +1,7 @@
 //! Parameters of the driver's edge; the node that uses it documents each in its configuration file.
 
+use pick_place::ContactSign;
 use serde::{Deserialize, Serialize};
-
-/// What tells that the tool touches something.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum ContactSign {
-    /// The driver's action `trajectory_until_node`: e-Series only.
-    #[default]
-    UntilAction,
-    /// The vacuum sensor, suction being on while the tip comes down.
-    Vacuum,
-    /// Nothing: the end of the way down is taken for the contact.
-    Height,
-}
 
 /// The driver and its wiring.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]

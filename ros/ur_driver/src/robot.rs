@@ -8,14 +8,13 @@ use msgs::ur_msgs::{
     FollowJointTrajectoryUntilGoal, FollowJointTrajectoryUntilResult, SetIORequest,
 };
 use node_kit::GoalStatus;
-use pick_place::Robot;
+use pick_place::{ContactSign, Robot};
 use tokio::runtime::Handle;
 use tokio::time::timeout;
 use tokio_util::sync::CancellationToken;
 use tracing::debug;
 use ur5::{JointTrajectory, Joints};
 
-use crate::ContactSign;
 use crate::readiness::Readiness;
 use crate::status::DriverStatus;
 use crate::{DriverClient, DriverError};

@@ -7,7 +7,10 @@ use std::time::Duration;
 use anyhow::Context as _;
 use node_kit::Level;
 use pick_place::{ExecuteError, Outcome, Phase, go_home, put_down};
-use step_protocol::{Proposal, ProposalId, Report, StepOutcome};
+use rehearsal::{HOME_SETTINGS, Picked, touchdown};
+use step_protocol::{
+    MotionCause, MotionEnd, MotionWord, Proposal, ProposalId, Report, StepOutcome, StopCause,
+};
 use tokio::runtime::Handle;
 use tokio::task::JoinHandle;
 use tokio_util::sync::CancellationToken;
@@ -15,47 +18,10 @@ use tracing::info;
 use ur_driver::{DriverError, DriverRobot};
 
 use super::Executor;
-use crate::dry_run::{HOME_SETTINGS, Picked};
-use crate::surface::touchdown;
-
-/// What moves the arm.
-#[derive(Clone, Copy, PartialEq, Eq)]
-pub(super) enum Cause {
-    /// An approved proposal.
-    Proposal(ProposalId),
-    /// An approved way home.
-    Home(ProposalId),
-    /// What is held is put down first.
-    PutDown(ProposalId),
-}
-
-/// Why a motion is stopped.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum StopCause {
-    Operator,
-    GoalCancelled,
-    NobodyPresent,
-    Disabled,
-    Deactivated,
-    Shutdown,
-}
-
-impl StopCause {
-    pub(super) const fn text(self) -> &'static str {
-        match self {
-            Self::Operator => "stopped by the operator",
-            Self::GoalCancelled => "stopped because its goal was cancelled",
-            Self::NobodyPresent => "stopped because no operator is present",
-            Self::Disabled => "stopped because the enabling input was low (driver.enable_pin)",
-            Self::Deactivated => "stopped because the executor was deactivated",
-            Self::Shutdown => "stopped because the executor was told to end",
-        }
-    }
-}
 
 /// A primitive, or the way home, under way.
 pub(super) struct Motion {
-    pub(super) cause: Cause,
+    pub(super) cause: MotionCause,
     stop: CancellationToken,
     /// What has stopped it first.
     stopped: Option<StopCause>,
@@ -104,7 +70,7 @@ impl Executor<'_> {
             tip: proposal.action.tips().0,
             seen: Arc::clone(seen),
         });
-        self.start(Cause::Proposal(id), move |robot| {
+        self.start(MotionCause::Proposal(id), move |robot| {
             let Proposal {
                 action, settings, ..
             } = &proposal;
@@ -139,7 +105,7 @@ impl Executor<'_> {
     pub(super) fn begin_home(&mut self, id: ProposalId) {
         info!("proposal {id}: moving home");
         let arm = self.work_cell.arm.clone();
-        self.start(Cause::Home(id), move |robot| {
+        self.start(MotionCause::Home(id), move |robot| {
             go_home(robot, &arm, &HOME_SETTINGS).map(|()| None)
         });
     }
@@ -150,7 +116,7 @@ impl Executor<'_> {
         let arm = self.work_cell.arm.clone();
         // The gate has asked for it before.
         let what = self.robot().put_down();
-        self.start(Cause::PutDown(id), move |robot| {
+        self.start(MotionCause::PutDown(id), move |robot| {
             let what = what.map_err(|reason| ExecuteError::Robot {
                 phase: Phase::Retreat,
                 error: DriverError::Fault(reason),
@@ -162,7 +128,7 @@ impl Executor<'_> {
     /// Moves the arm on a thread of its own.
     pub(super) fn start(
         &mut self,
-        cause: Cause,
+        cause: MotionCause,
         work: impl FnOnce(&mut DriverRobot) -> Result<Option<Outcome>, ExecuteError<DriverError>>
         + Send
         + 'static,
@@ -183,7 +149,7 @@ impl Executor<'_> {
 
     pub(super) fn on_end(
         &mut self,
-        cause: Cause,
+        cause: MotionCause,
         stopped: Option<StopCause>,
         ended: anyhow::Result<Ended>,
     ) {
@@ -194,54 +160,34 @@ impl Executor<'_> {
             Ok(ended) => (Ok(ended.result), ended.stamps),
             Err(error) => (Err(error), None),
         };
-        let (outcome, mut reason) = match result {
-            Ok(Ok(Some(outcome))) => (StepOutcome::from(outcome), why(outcome).to_owned()),
-            Ok(Ok(None)) => match cause {
-                Cause::PutDown(_) => (
-                    StepOutcome::AtHome,
-                    "what was held is put down where it was picked".to_owned(),
-                ),
-                Cause::Home(_) | Cause::Proposal(_) => (StepOutcome::AtHome, String::new()),
-            },
+        let end = match result {
+            Ok(Ok(outcome)) => MotionEnd::Done(outcome),
             Ok(Err(ExecuteError::Robot {
                 phase,
                 error: DriverError::Stopped,
-            })) => (
-                StepOutcome::Stopped,
-                // Who else would stop it has said so.
-                format!(
-                    "{phase:?}: {}",
-                    stopped.unwrap_or(StopCause::Disabled).text()
-                ),
-            ),
-            Ok(Err(error)) => (StepOutcome::Fault, error.to_string()),
-            Err(error) => (StepOutcome::Fault, format!("{error:#}")),
+            })) => MotionEnd::Stopped(phase),
+            Ok(Err(error)) => MotionEnd::Failed(error.to_string()),
+            Err(error) => MotionEnd::Failed(format!("{error:#}")),
         };
-        let broken_off = matches!(outcome, StepOutcome::Stopped | StepOutcome::Fault);
-        if broken_off {
-            self.stop_memory.remember(&reason);
-            reason += "; the arm stands where it is, suction is as it was; a new observation and approval are needed";
-        } else if stopped.is_some() {
-            reason = format!("the stop came after the end. {reason}")
-                .trim()
-                .to_owned();
+        let MotionWord {
+            outcome,
+            reason,
+            broken_off,
+        } = end.word(cause, stopped);
+        if let Some(reason) = &broken_off {
+            self.stop_memory.remember(reason);
         }
-        let level = if outcome == StepOutcome::Fault {
-            Level::Error
-        } else {
-            Level::Ok
+        let level = match outcome {
+            StepOutcome::Fault => Level::Error,
+            _ => Level::Ok,
         };
         self.node.diagnostics().set("motion", level, &reason, []);
         // Observations from then on show the result. Simulated time may still be on its way.
         let now = Duration::from_nanos(self.node.clock().now_ns().max(0) as u64);
         let end = stamps.map_or(now, |(_, last)| last.max(now));
         let duration = stamps.map_or(Duration::ZERO, |(first, last)| last - first.min(last));
-        let actions = self.gate.finish(end, broken_off);
-        let (id, outcome) = match cause {
-            Cause::Proposal(id) => (id, outcome),
-            Cause::Home(id) | Cause::PutDown(id) if broken_off => (id, StepOutcome::NotHome),
-            Cause::Home(id) | Cause::PutDown(id) => (id, StepOutcome::AtHome),
-        };
+        let actions = self.gate.finish(end, broken_off.is_some());
+        let id = cause.id();
         let report = Report {
             id,
             outcome,
@@ -260,7 +206,7 @@ impl Executor<'_> {
 /// Waits for the end of a motion, and takes it; for ever when there is none.
 pub(super) async fn end_of(
     motion: &mut Option<Motion>,
-) -> (Cause, Option<StopCause>, anyhow::Result<Ended>) {
+) -> (MotionCause, Option<StopCause>, anyhow::Result<Ended>) {
     match motion {
         Some(running) => {
             let ended = (&mut running.task).await;
@@ -270,15 +216,5 @@ pub(super) async fn end_of(
             (cause, stopped, ended)
         }
         None => std::future::pending().await,
-    }
-}
-
-fn why(outcome: Outcome) -> &'static str {
-    match outcome {
-        Outcome::Placed => "",
-        Outcome::NoContact => "the descent met nothing to pick",
-        Outcome::GraspFailed => "suction held nothing",
-        Outcome::Dropped => "the object was lost on the way",
-        Outcome::LagAborted => "the tip lagged too far behind; the object was released",
     }
 }

@@ -1,11 +1,12 @@
 //! Proposals and the operator's confirmations.
 
 use msgs::{convert, sctn_msgs};
-use step_protocol::{GateAction, Judgement, OperatorDecision, Proposal, ProposalId, Proposed};
+use step_protocol::{
+    GateAction, Judgement, OperatorDecision, Proposal, ProposalId, Proposed, StopCause,
+};
 use tracing::info;
 
 use super::Executor;
-use super::motion::StopCause;
 
 impl Executor<'_> {
     pub(super) fn on_proposal(&mut self, message: sctn_msgs::PickPlace) {

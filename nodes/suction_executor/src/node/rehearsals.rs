@@ -5,16 +5,17 @@ use std::collections::VecDeque;
 use std::sync::Arc;
 
 use anyhow::Context as _;
-use msgs::sctn_msgs::ProposeHomeResponse;
+use msgs::convert::{self, ConvertError};
+use msgs::sctn_msgs::{self, ProposeHomeResponse};
 use msgs::std_msgs;
 use node_kit::RequestId;
+use rehearsal::{PlannedPrimitive, Rehearsed, Subject};
 use step_protocol::{CannotBegin, OperatorDecision, ProposalId, Recovery};
 use tokio::task::JoinHandle;
 use tracing::{info, warn};
 use ur_driver::planted::{Planted, is_planted};
 
 use super::Executor;
-use crate::dry_run::{PlannedPrimitive, Rehearsed, Subject, planned_motion};
 
 /// What was rehearsed, is being rehearsed and is to be.
 #[derive(Default)]
@@ -158,9 +159,33 @@ impl Executor<'_> {
             stamp: self.node.now(),
             frame_id: self.parameters.world_frame.clone(),
         };
-        match planned_motion(planned, id.0, &self.work_cell.joint_names, header) {
+        match planned_motion(planned, id, &self.work_cell.joint_names, header) {
             Ok(motion) => self.planned.publish(motion),
             Err(error) => warn!("the motion of proposal {id}: {error}"),
         }
     }
+}
+
+/// The message that shows a motion, or why there is none.
+fn planned_motion(
+    planned: Result<PlannedPrimitive, String>,
+    id: ProposalId,
+    joint_names: &[String; 6],
+    header: std_msgs::Header,
+) -> Result<sctn_msgs::PlannedMotion, ConvertError> {
+    let (motion, reason) = match planned {
+        Ok(motion) => (motion, String::new()),
+        Err(reason) => (PlannedPrimitive::default(), reason),
+    };
+    let mut trajectory = convert::trajectory_points_to_msg(motion.points(), joint_names)?;
+    trajectory.header = header.clone();
+    let [on, off] = motion.suction();
+    Ok(sctn_msgs::PlannedMotion {
+        trajectory,
+        header,
+        proposal_id: id.0,
+        suction_on: convert::duration_to_msg(on)?,
+        suction_off: convert::duration_to_msg(off)?,
+        reason,
+    })
 }

@@ -1,6 +1,5 @@
-//! A dry run of a motion: it is planned to the end and checked for collisions, and nothing moves.
+//! The robot as the gate sees it, and what was rehearsed for it.
 
-use std::convert::Infallible;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -8,141 +7,46 @@ use collision::{
     Carried, CollisionChecker, Situation, lift_out, rehearse, rehearse_home, rehearse_put_down,
 };
 use heightmap::{ChangeRules, Heightmap, largest_change};
-use msgs::convert::{self, ConvertError};
-use msgs::std_msgs::Header;
-use msgs::{sctn_msgs, trajectory_msgs};
 use nalgebra::{Isometry2, Point2};
-use pick_place::{PickPlace, PrimitiveSettings, PutDown, Robot, go_home, put_down};
+use pick_place::{
+    ContactSettings, ContactSign, PickPlace, PrimitiveSettings, PutDown, go_home, put_down,
+};
 use step_protocol::{
     AT_REST_RAD, CannotBegin, JointPositions, Proposal, ProposalId, Recovery, RobotState,
 };
-use ur_driver::ContactSign;
-use ur_driver::status::DriverStatus;
-use ur5::{Arm, JointTrajectory, Joints, TrajectoryPoint};
+use ur5::{Arm, AtHome, Joints};
 
-use crate::parameters::Contact;
+use crate::planned::{DryRun, PlannedPrimitive};
 use crate::surface::{top_m, touchdown};
 
 /// The way home is slow, because something may be held or in the way, and begins with a rise as high as the arm can.
-pub(crate) const HOME_SETTINGS: PrimitiveSettings = PrimitiveSettings {
+pub const HOME_SETTINGS: PrimitiveSettings = PrimitiveSettings {
     travel_m_s: 0.25,
     descend_m_s: 0.1,
     acceleration_m_s2: 0.5,
     ..PrimitiveSettings::RIGID
 };
 
+const UNKNOWN: &str = "the robot's state is not known";
+
 /// Where an object is put down the tip slows down so far above (m).
 const SLOW_FROM_M: f64 = 0.03;
 
 /// Where the last motion has picked, and what was seen before.
 #[derive(Clone, Debug)]
-pub(crate) struct Picked {
+pub struct Picked {
     /// Pose of the tip in the world's xy-plane.
     pub tip: Isometry2<f64>,
     /// The newest heightmap when the motion began.
     pub seen: Arc<Heightmap>,
 }
 
-/// A robot that is always where it was sent, and whose tool finds the table.
-struct DryRun {
-    joints: Joints,
-    holds: bool,
-    motion: PlannedPrimitive,
-}
-
-/// The whole motion of a proposal, from where the arm stands until it is home.
-#[derive(Clone, Debug, Default, PartialEq)]
-pub(crate) struct PlannedPrimitive {
-    /// Times are from the beginning and increase.
-    points: Vec<TrajectoryPoint>,
-    /// When suction is switched on, and when off.
-    suction: [Duration; 2],
-}
-
-impl PlannedPrimitive {
-    fn end(&self) -> Duration {
-        self.points
-            .last()
-            .map_or(Duration::ZERO, |point| point.time)
-    }
-
-    fn append(&mut self, trajectory: &JointTrajectory) {
-        let start = self.end();
-        for point in trajectory.points() {
-            let time = start + point.time;
-            if self.points.is_empty() || time > self.end() {
-                self.points.push(TrajectoryPoint { time, ..*point });
-            }
-        }
-    }
-}
-
-/// The message that shows a proposal's motion, or why there is none.
-pub(crate) fn planned_motion(
-    planned: Result<PlannedPrimitive, String>,
-    proposal_id: u64,
-    joint_names: &[String; 6],
-    header: Header,
-) -> Result<sctn_msgs::PlannedMotion, ConvertError> {
-    let (motion, reason) = match planned {
-        Ok(motion) => (motion, String::new()),
-        Err(reason) => (PlannedPrimitive::default(), reason),
-    };
-    let point = |point: &TrajectoryPoint| {
-        Ok::<_, ConvertError>(trajectory_msgs::JointTrajectoryPoint {
-            positions: point.positions_rad.iter().copied().collect(),
-            velocities: point.velocities_rad_s.iter().copied().collect(),
-            time_from_start: convert::duration_to_msg(point.time)?,
-            ..Default::default()
-        })
-    };
-    let [on, off] = motion.suction;
-    Ok(sctn_msgs::PlannedMotion {
-        trajectory: trajectory_msgs::JointTrajectory {
-            header: header.clone(),
-            joint_names: joint_names.to_vec(),
-            points: motion.points.iter().map(point).collect::<Result<_, _>>()?,
-        },
-        header,
-        proposal_id,
-        suction_on: convert::duration_to_msg(on)?,
-        suction_off: convert::duration_to_msg(off)?,
-        reason,
-    })
-}
-
-impl Robot for DryRun {
-    type Error = Infallible;
-
-    fn joints(&mut self) -> Result<Joints, Infallible> {
-        Ok(self.joints)
-    }
-
-    fn follow(&mut self, trajectory: &JointTrajectory) -> Result<bool, Infallible> {
-        self.joints = trajectory.last().positions_rad;
-        self.motion.append(trajectory);
-        Ok(true)
-    }
-
-    fn follow_until_contact(&mut self, trajectory: &JointTrajectory) -> Result<bool, Infallible> {
-        self.follow(trajectory)
-    }
-
-    fn set_suction(&mut self, on: bool) -> Result<(), Infallible> {
-        self.holds = on;
-        self.motion.suction[usize::from(!on)] = self.motion.end();
-        Ok(())
-    }
-
-    fn holds(&mut self) -> Result<bool, Infallible> {
-        Ok(self.holds)
-    }
-}
-
 /// What is rehearsed.
 #[derive(Clone, Debug)]
-pub(crate) enum Subject {
+pub enum Subject {
+    /// A proposal.
     Proposal(Box<Proposal>),
+    /// What brings the arm home.
     Recovery(Recovery),
 }
 
@@ -159,7 +63,8 @@ struct Basis {
 
 /// A motion that was rehearsed.
 #[derive(Clone, Debug)]
-pub(crate) struct Rehearsed {
+pub struct Rehearsed {
+    /// Of what.
     pub subject: Subject,
     /// The motion, or why it cannot be carried out.
     pub planned: Result<PlannedPrimitive, String>,
@@ -226,19 +131,21 @@ impl Rehearsed {
     }
 }
 
-/// What the gate asks about: the robot as its driver last said it was.
+/// What the gate asks about: the robot as its driver last said it was, and what was seen.
 #[derive(Clone)]
-pub(crate) struct RobotNow {
+pub struct RobotNow {
+    /// The arm.
     pub arm: Arm,
-    pub status: DriverStatus,
-    /// Monotonic, as the arrivals in `status`.
-    pub now: Duration,
-    /// The driver's streams may not be older.
-    pub max_age: Duration,
-    /// Why nothing may begin to move, where an operator has to be present and none is.
-    pub unattended: Option<String>,
-    /// What the driver was found to lack.
-    pub refused: Option<String>,
+    /// Checks motions against cell and arm.
+    pub checker: Arc<CollisionChecker>,
+    /// Why nothing may begin to move, where there is a reason.
+    pub obstacle: Option<String>,
+    /// Where the joints are (rad), where that is known.
+    pub joints_rad: Option<Joints>,
+    /// Whether the gripper holds something, where that is known.
+    pub holds: Option<bool>,
+    /// Whether the arm is out of the cameras' view.
+    pub at_home: AtHome,
     /// ROS time.
     pub time: Duration,
     /// The newest heightmap and its stamp.
@@ -249,15 +156,16 @@ pub(crate) struct RobotNow {
     pub needs_home: bool,
     /// An approval needs a heightmap that is not older.
     pub observation_max_age: Duration,
-    pub contact: Contact,
+    /// What counts as a change of the view.
+    pub changes: ChangeRules,
+    /// How the tip comes down.
+    pub contact: ContactSettings,
+    /// What tells that the tool touches something.
     pub sign: ContactSign,
-    pub checker: Arc<CollisionChecker>,
     /// The newest heightmap that is sure not to show the arm.
     pub without_arm: Option<Arc<Heightmap>>,
     /// What the gripper holds, where it holds something.
     pub picked: Option<Picked>,
-    /// What counts as a change of the view.
-    pub changes: ChangeRules,
     /// The proposal that was rehearsed last.
     pub rehearsed: Option<Arc<Rehearsed>>,
     /// The way home, or the putting down, that was rehearsed last.
@@ -266,10 +174,7 @@ pub(crate) struct RobotNow {
 
 impl RobotState for RobotNow {
     fn obstacle(&self) -> Option<String> {
-        let unattended = self.unattended.clone();
-        unattended
-            .or_else(|| self.status.obstacle(self.now, self.max_age))
-            .or_else(|| self.refused.clone())
+        self.obstacle.clone()
     }
 
     fn check_motion(&self, proposal: &Proposal) -> Result<(), CannotBegin> {
@@ -281,7 +186,7 @@ impl RobotState for RobotNow {
     fn check_recovery(&self, recovery: Recovery) -> Result<JointPositions, CannotBegin> {
         let rehearsed = self.rehearsal_of_recovery(recovery);
         rehearsed.ok_or(CannotBegin::NotRehearsed)?.verdict()?;
-        self.joints_rad().map_err(CannotBegin::Refused)
+        self.known_joints().map_err(CannotBegin::Refused)
     }
 }
 
@@ -294,7 +199,7 @@ impl RobotNow {
         if self.unseen {
             return Err("nobody publishes heightmaps any more: whether the cameras see what they saw is not known".into());
         }
-        let in_view = |stamp| self.status.at_home.may_be_in_view(stamp);
+        let in_view = |stamp| self.at_home.may_be_in_view(stamp);
         if self.needs_home && (in_view(proposal.stamp) || in_view(*stamp)) {
             return Err("the arm was not at home and at rest when the heightmap was taken, or has left home since: call it home first".into());
         }
@@ -338,36 +243,36 @@ impl RobotNow {
     }
 
     fn basis(&self, subject: &Subject) -> Option<Basis> {
-        let (joints, pins) = (self.status.joints.as_ref()?, self.status.pins.as_ref()?);
         let (view, picked) = match subject {
             Subject::Proposal(_) => (Some(Arc::clone(&self.seen.as_ref()?.0)), None),
             Subject::Recovery(_) => (self.without_arm.clone(), self.picked.clone()),
         };
         Some(Basis {
-            joints_rad: joints.value.positions_rad,
-            holds: pins.value.vacuum,
+            joints_rad: self.joints_rad?,
+            holds: self.holds?,
             view,
             picked,
         })
     }
 
-    fn joints_rad(&self) -> Result<JointPositions, String> {
-        let joints = self.status.joints.as_ref();
-        let joints = joints.ok_or("the robot's state is not known")?;
-        Ok(joints.value.positions_rad)
+    fn known_joints(&self) -> Result<JointPositions, String> {
+        self.joints_rad.ok_or_else(|| UNKNOWN.to_owned())
+    }
+
+    /// Where the joints are (rad), and whether something is held.
+    fn known(&self) -> Result<(Joints, bool), String> {
+        self.joints_rad
+            .zip(self.holds)
+            .ok_or_else(|| UNKNOWN.to_owned())
     }
 
     /// How what is held is put down where it was picked, and the way home after that, checked like the way home alone.
     fn dry_run_put_down(&self) -> Result<PlannedPrimitive, String> {
         let what = self.put_down()?;
-        let joints = self.joints_rad()?;
+        let joints = self.known_joints()?;
         let lifted = self.lifted_out(true);
         let (carried, heightmap) = lifted.ok_or("what is held lay outside the heightmap")?;
-        let mut robot = DryRun {
-            joints,
-            holds: true,
-            motion: PlannedPrimitive::default(),
-        };
+        let mut robot = DryRun::new(joints, true);
         let (arm, settings) = (&self.arm, &HOME_SETTINGS);
         put_down(&mut robot, arm, &what, settings).map_err(|error| error.to_string())?;
         rehearse_put_down(
@@ -379,13 +284,15 @@ impl RobotNow {
             &heightmap,
         )
         .map_err(|error| format!("putting down: {error}"))?;
-        Ok(robot.motion)
+        Ok(robot.motion())
     }
 
     /// Where what is held was picked.
+    ///
+    /// # Errors
+    /// Nothing is held, or nobody saw where it was picked.
     pub fn put_down(&self) -> Result<PutDown, String> {
-        let pins = self.status.pins.as_ref();
-        if !pins.is_some_and(|pins| pins.value.vacuum) {
+        if self.holds != Some(true) {
             return Err("the gripper holds nothing: there is nothing to put down".into());
         }
         let unseen = "nobody saw where what is held was picked: call the arm home, and take the part away by hand";
@@ -405,25 +312,18 @@ impl RobotNow {
     /// The way home from where the robot is, checked against the cell and against what stood on the table when the arm was last out of view;
     /// else why it cannot be planned, or what it would hit.
     fn dry_run_home(&self) -> Result<PlannedPrimitive, String> {
-        let (Some(joints), Some(pins)) = (&self.status.joints, &self.status.pins) else {
-            return Err("the robot's state is not known".into());
-        };
-        let joints = joints.value.positions_rad;
-        let mut robot = DryRun {
-            joints,
-            holds: pins.value.vacuum,
-            motion: PlannedPrimitive::default(),
-        };
+        let (joints, holds) = self.known()?;
+        let mut robot = DryRun::new(joints, holds);
         let (arm, settings) = (&self.arm, &HOME_SETTINGS);
         go_home(&mut robot, arm, settings).map_err(|error| error.to_string())?;
-        let lifted = self.lifted_out(pins.value.vacuum);
+        let lifted = self.lifted_out(holds);
         let (carried, heightmap) = match &lifted {
             Some((carried, rest)) => (Some(*carried), Some(rest)),
             None => (None, self.without_arm.as_deref()),
         };
         rehearse_home(&self.checker, arm, settings, &joints, carried, heightmap)
             .map_err(|error| format!("the way home: {error}"))?;
-        Ok(robot.motion)
+        Ok(robot.motion())
     }
 
     /// What the gripper holds, and the heightmap without it; nothing where it holds nothing, or nobody saw it.
@@ -444,7 +344,7 @@ impl RobotNow {
     /// it cannot be planned, or what it would hit.
     fn planned(&self, proposal: &Proposal) -> Result<PlannedPrimitive, String> {
         let planned = self.dry_run(proposal)?;
-        let (Some(joints), Some((heightmap, _))) = (&self.status.joints, &self.seen) else {
+        let (Some(joints), Some((heightmap, _))) = (&self.joints_rad, &self.seen) else {
             return Ok(planned);
         };
         let Proposal {
@@ -452,7 +352,7 @@ impl RobotNow {
         } = proposal;
         let touchdown = touchdown(heightmap, action, &self.contact, self.sign)?;
         let situation = Situation {
-            joints: &joints.value.positions_rad,
+            joints,
             holds: false,
             heightmap: Some(heightmap),
             touchdown: touchdown.as_ref(),
@@ -464,14 +364,8 @@ impl RobotNow {
 
     /// The motion of a proposal from where the robot is; else why it cannot be planned.
     fn dry_run(&self, proposal: &Proposal) -> Result<PlannedPrimitive, String> {
-        let (Some(joints), Some(pins)) = (&self.status.joints, &self.status.pins) else {
-            return Err("the robot's state is not known".into());
-        };
-        let mut robot = DryRun {
-            joints: joints.value.positions_rad,
-            holds: pins.value.vacuum,
-            motion: PlannedPrimitive::default(),
-        };
+        let (joints, holds) = self.known()?;
+        let mut robot = DryRun::new(joints, holds);
         let Proposal {
             action, settings, ..
         } = proposal;
@@ -488,45 +382,15 @@ impl RobotNow {
             |_| (),
         )
         .map_err(|error| error.to_string())?;
-        Ok(robot.motion)
+        Ok(robot.motion())
     }
 }
 
 #[cfg(test)]
 mod tests {
     use super::*;
-    use msgs::convert::JointReading;
-    use nalgebra::{Isometry2, Vector2};
-    use pick_place::{PickPlace, PrimitiveSettings};
-    use step_protocol::ProposalId;
-    use ur_driver::status::{Newest, Pins};
+    use nalgebra::Vector2;
     use ur5::WorkCell;
-
-    /// A driver that is ready.
-    fn ready() -> DriverStatus {
-        let reading = JointReading {
-            stamp: Duration::from_secs(5),
-            positions_rad: Joints::zeros(),
-            velocities_rad_s: Joints::zeros(),
-        };
-        DriverStatus {
-            // RUNNING and NORMAL.
-            robot_mode: Some(7),
-            safety_mode: Some(1),
-            program_running: Some(true),
-            joints: Some(Newest {
-                value: reading,
-                at: Duration::ZERO,
-                count: 1,
-            }),
-            pins: Some(Newest {
-                value: Pins::default(),
-                at: Duration::ZERO,
-                count: 1,
-            }),
-            ..DriverStatus::default()
-        }
-    }
 
     fn proposal(x_m: f64) -> Proposal {
         let pose = |y_m| Isometry2::new(Vector2::new(x_m, y_m), 0.0);
@@ -580,80 +444,39 @@ mod tests {
     #[test]
     fn only_what_can_be_planned_to_its_end_may_begin() {
         let arm = WorkCell::builtin().unwrap().arm;
-        let mut status = ready();
-        status.joints.as_mut().unwrap().value.positions_rad = arm.home;
         let mut robot = RobotNow {
-            arm,
-            status,
-            now: Duration::ZERO,
-            max_age: Duration::from_secs(1),
-            unattended: None,
-            refused: None,
-            unseen: false,
-            needs_home: false,
-            time: Duration::ZERO,
+            joints_rad: Some(arm.home),
             seen: Some((
                 Arc::new(Heightmap::new(heightmap::Workspace::RAVENS)),
                 Duration::ZERO,
             )),
-            observation_max_age: Duration::from_secs(10),
-            contact: Contact::default(),
-            sign: ContactSign::UntilAction,
-            checker: checker(),
-            without_arm: None,
-            picked: None,
-            changes: ChangeRules::default(),
-            rehearsed: None,
-            rehearsed_recovery: None,
+            ..robot_at(0.0, 0.3)
         };
-        assert_eq!(robot.obstacle(), None);
+        assert_eq!(RobotState::obstacle(&robot), None);
         planned(&robot, &proposal(0.5)).unwrap();
         let motion = robot.dry_run(&proposal(0.5)).unwrap();
-        let names: [String; 6] = std::array::from_fn(|joint| format!("joint {joint}"));
-        let message = planned_motion(Ok(motion), 7, &names, Header::default()).unwrap();
-        assert_eq!((message.proposal_id, message.reason.as_str()), (7, ""));
-        let points = &message.trajectory.points;
+        let points = motion.points();
         assert!(points.len() > 100, "{}", points.len());
-        let time =
-            |stamp: &msgs::builtin_interfaces::Duration| convert::duration_from_msg(stamp).unwrap();
-        let times: Vec<_> = points
-            .iter()
-            .map(|point| time(&point.time_from_start))
-            .collect();
-        assert!(times.is_sorted_by(|a, b| a < b));
-        let [on, off] = [&message.suction_on, &message.suction_off].map(time);
-        assert!(Duration::ZERO < on && on < off && off < times[times.len() - 1]);
+        assert!(points.is_sorted_by(|a, b| a.time < b.time));
+        let [on, off] = motion.suction();
+        assert!(Duration::ZERO < on && on < off && off < points[points.len() - 1].time);
         // From home to home, without a jump.
-        let home: Vec<f64> = robot.arm.home.iter().copied().collect();
-        assert_eq!(points[0].positions, home);
-        for (a, b) in points[points.len() - 1].positions.iter().zip(&home) {
-            assert!((a - b).abs() < 1e-6, "{a} {b}");
-        }
+        let home = robot.arm.home;
+        assert_eq!(points[0].positions_rad, home);
+        let last = points[points.len() - 1].positions_rad;
+        assert!((last - home).amax() < 1e-6);
         for pair in points.windows(2) {
-            let steps = pair[0].positions.iter().zip(&pair[1].positions);
-            assert!(steps.into_iter().all(|(a, b)| (a - b).abs() < 0.2));
+            assert!((pair[0].positions_rad - pair[1].positions_rad).amax() < 0.2);
         }
-        let refused = robot.dry_run(&proposal(2.0));
-        let message = planned_motion(refused, 8, &names, Header::default()).unwrap();
-        assert!(message.trajectory.points.is_empty() && message.reason.contains("pick"));
         let reason = planned(&robot, &proposal(2.0)).unwrap_err();
         assert!(
             reason.contains("pick") && !reason.contains('\n'),
             "{reason}"
         );
-        let holding = Pins {
-            suction: true,
-            vacuum: true,
-            ..Pins::default()
-        };
-        robot.status.pins = Some(Newest {
-            value: holding,
-            at: Duration::ZERO,
-            count: 1,
-        });
+        robot.holds = Some(true);
         let reason = planned(&robot, &proposal(0.5)).unwrap_err();
         assert!(reason.contains("already holds"), "{reason}");
-        robot.status.pins.as_mut().unwrap().value.vacuum = false;
+        robot.holds = Some(false);
         planned(&robot, &proposal(0.5)).unwrap();
         robot.unseen = true;
         let reason = planned(&robot, &proposal(0.5)).unwrap_err();
@@ -662,17 +485,14 @@ mod tests {
         robot.time = Duration::from_secs(11);
         let reason = planned(&robot, &proposal(0.5)).unwrap_err();
         assert!(reason.contains("11.0 s old"), "{reason}");
-        robot.now = Duration::from_secs(11);
-        assert!(robot.obstacle().unwrap().contains("joint_states"));
-        robot.now = Duration::ZERO;
         robot.time = Duration::ZERO;
         robot.needs_home = true;
         let read = |robot: &mut RobotNow, stamp_s, offset_rad| {
             let home = robot.arm.home;
             let joints = home.add_scalar(offset_rad);
             let stamp = Duration::from_secs(stamp_s);
-            let status = &mut robot.status;
-            status.at_home.read(stamp, &joints, &Joints::zeros(), &home);
+            let at_home = &mut robot.at_home;
+            at_home.read(stamp, &joints, &Joints::zeros(), &home);
         };
         let in_view = |robot: &RobotNow, stamp_s| {
             let proposal = Proposal {
@@ -696,8 +516,8 @@ mod tests {
         robot.seen = None;
         let reason = planned(&robot, &proposal(0.5)).unwrap_err();
         assert!(reason.contains("no heightmap"), "{reason}");
-        robot.refused = Some("controller `x` is inactive".into());
-        assert!(robot.obstacle().unwrap().contains("inactive"));
+        robot.obstacle = Some("controller `x` is inactive".into());
+        assert_eq!(RobotState::obstacle(&robot), robot.obstacle);
     }
 
     fn checker() -> Arc<CollisionChecker> {
@@ -709,22 +529,19 @@ mod tests {
     fn robot_at(y_m: f64, height_m: f64) -> RobotNow {
         let arm = WorkCell::builtin().unwrap().arm;
         let over = Isometry2::new(Vector2::new(0.5, y_m), 0.0);
-        let mut status = ready();
         let joints = arm.solve(&Arm::tip_down(&over, height_m), &arm.ready);
-        status.joints.as_mut().unwrap().value.positions_rad = joints.unwrap();
         RobotNow {
             arm,
-            status,
-            now: Duration::ZERO,
-            max_age: Duration::from_secs(1),
-            unattended: None,
-            refused: None,
+            obstacle: None,
+            joints_rad: Some(joints.unwrap()),
+            holds: Some(false),
+            at_home: AtHome::default(),
             unseen: false,
             needs_home: false,
             time: Duration::ZERO,
             seen: None,
             observation_max_age: Duration::from_secs(10),
-            contact: Contact::default(),
+            contact: ContactSettings::default(),
             sign: ContactSign::UntilAction,
             checker: checker(),
             without_arm: None,
@@ -758,10 +575,10 @@ mod tests {
     fn the_way_home_is_planned_from_the_table_too_and_names_what_it_would_hit() {
         let mut robot = robot_at(-0.35, 0.001);
         let motion = robot.dry_run_home().unwrap();
-        let last = motion.points.last().unwrap().positions_rad;
+        let last = motion.points().last().unwrap().positions_rad;
         assert!((last - robot.arm.home).amax() < 1e-6);
         let from_rad = recovery(&robot, Recovery::Home).unwrap();
-        assert_eq!(from_rad, motion.points[0].positions_rad);
+        assert_eq!(from_rad, motion.points()[0].positions_rad);
         // Home lies on the other side of a wall that the cameras saw.
         robot.without_arm = Some(table_with_a_wall());
         let reason = robot.dry_run_home().unwrap_err();
@@ -779,7 +596,7 @@ mod tests {
         robot.dry_run_home().unwrap();
         let tip = Isometry2::new(Vector2::new(0.5, 0.1), 0.0);
         robot.picked = Some(Picked { tip, seen });
-        robot.status.pins.as_mut().unwrap().value.vacuum = true;
+        robot.holds = Some(true);
         let (carried, rest) = robot.lifted_out(true).unwrap();
         assert!((0.02..0.05).contains(&carried.radius_m()), "{carried:?}");
         let index = |at: &Point2<f64>| {
@@ -805,28 +622,25 @@ mod tests {
         robot.without_arm = Some(Arc::clone(&seen));
         let reason = recovery(&robot, Recovery::PutDown).unwrap_err();
         assert!(reason.contains("holds nothing"), "{reason}");
-        robot.status.pins.as_mut().unwrap().value.vacuum = true;
+        robot.holds = Some(true);
         let reason = recovery(&robot, Recovery::PutDown).unwrap_err();
         assert!(reason.contains("nobody saw"), "{reason}");
         robot.picked = Some(Picked { tip, seen });
         let motion = robot.dry_run_put_down().unwrap();
         assert!((robot.put_down().unwrap().contact_m - 0.04).abs() < 1e-6);
         // Suction is switched off where the cup was at the pick, and the arm ends at home.
-        let release = motion.suction[1];
-        let at = motion.points.iter().find(|point| point.time == release);
+        let release = motion.suction()[1];
+        let at = motion.points().iter().find(|point| point.time == release);
         let tip_at = robot.arm.tip(&at.unwrap().positions_rad);
         let expected = Arm::tip_down(&tip, 0.04 - robot.contact.window_m);
         assert!((tip_at.translation.vector - expected.translation.vector).norm() < 1e-4);
         assert!(tip_at.rotation.angle_to(&expected.rotation) < 1e-4);
-        let last = motion.points.last().unwrap().positions_rad;
+        let last = motion.points().last().unwrap().positions_rad;
         assert!((last - robot.arm.home).amax() < 1e-6);
         // From behind the wall.
         let behind = robot_at(-0.35, 0.2);
         let refused = RobotNow {
-            status: DriverStatus {
-                pins: robot.status.pins,
-                ..behind.status.clone()
-            },
+            holds: robot.holds,
             without_arm: robot.without_arm.clone(),
             picked: robot.picked.clone(),
             ..behind
@@ -869,13 +683,13 @@ mod tests {
         assert!(is_due(&robot));
         robot.seen = Some((seen, Duration::from_secs(1)));
         assert!(!is_due(&robot));
-        robot.status.joints.as_mut().unwrap().value.positions_rad[2] += 0.01;
+        robot.joints_rad.as_mut().unwrap()[2] += 0.01;
         assert!(is_due(&robot));
-        robot.status.joints.as_mut().unwrap().value.positions_rad[2] -= 0.01;
-        robot.status.pins.as_mut().unwrap().value.vacuum = true;
+        robot.joints_rad.as_mut().unwrap()[2] -= 0.01;
+        robot.holds = Some(true);
         assert!(is_due(&robot));
         // Of another proposal.
-        robot.status.pins.as_mut().unwrap().value.vacuum = false;
+        robot.holds = Some(false);
         let other = Proposal {
             id: ProposalId(2),
             ..proposal.clone()

@@ -2,6 +2,7 @@
 
 use crate::root::Root;
 use anyhow::{Context as _, Result, bail, ensure};
+use cell_emulation::cameras::camera_transforms;
 use heightmap::{Camera, Intrinsics};
 use msgs::convert;
 use msgs::diagnostic_msgs::DiagnosticArray;
@@ -10,7 +11,6 @@ use msgs::sensor_msgs::{CameraInfo, Image};
 use msgs::tf2_msgs::TFMessage;
 use node_kit::{Context, Network, NoParameters, Publisher, Qos, RosArguments, Subscription};
 use serde::Serialize;
-use sim_workcell::frames::camera_transforms;
 use std::collections::BTreeMap;
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};

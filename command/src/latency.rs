@@ -3,13 +3,13 @@
 use crate::demos::demonstration;
 use crate::root::Root;
 use anyhow::{Context as _, Result, bail};
+use cell_emulation::cameras::{CameraTopics, Frame, camera_transforms};
 use gctn::{Compact, ModelCard, Network, NetworkConfig, Storage, Trainer, TrainingConfig};
 use msgs::convert;
 use msgs::sctn_msgs::{Goal, PickPlace};
 use msgs::tf2_msgs::TFMessage;
 use multiravens::Environment;
 use node_kit::{Context, NoParameters, Node, Publisher, Qos, RosArguments, Subscription};
-use sim_workcell::frames::{CameraTopics, Frame, camera_transforms};
 use std::time::{Duration, Instant};
 use tokio::runtime::Runtime;
 

@@ -1,6 +1,5 @@
 //! The thread that owns the simulated hardware: what it is asked, one thing after the other, and what is wrong with it.
 
-mod goal;
 mod images;
 mod motion;
 mod reports;
@@ -10,30 +9,25 @@ use std::sync::{Arc, mpsc};
 use std::thread;
 use std::time::{Duration, Instant};
 
-use driver_model::{AcceptanceQueue, Answer, EncoderNoise, Fault, HardwareSettings};
+use cell_emulation::cameras::{CameraTopics, Frame};
+use cell_emulation::{Acceptance, Goal, Request, StatusPublishers, output_from_msg};
+use driver_model::{EncoderNoise, Fault};
 use msgs::rosgraph_msgs::Clock;
 use msgs::sctn_msgs::{ResetCellRequest, ResetCellResponse, Reward};
-use msgs::sensor_msgs::JointState;
-use msgs::std_msgs::{self, Bool, Float64};
+use msgs::std_msgs;
 use msgs::tf2_msgs::TFMessage;
-use msgs::ur_dashboard_msgs::{RobotMode, SafetyMode};
-use msgs::ur_msgs::{FollowJointTrajectoryUntil, IOStates, SetIORequest, ToolDataMsg};
+use msgs::ur_msgs::SetIORequest;
 use multiravens::Problem;
-use node_kit::{NewGoal, Node, Publisher, Qos, ReplyCache};
+use node_kit::{Node, Publisher, Qos, ReplyCache};
 use simulated_cell::{Pins, SimulatedCell};
 use tokio::sync::oneshot;
 use tracing::{info, warn};
 use ur5::WorkCell;
 
-use self::goal::Activity;
 use self::reports::fixed_transforms;
-use crate::driver::{follow_trajectory, output_from_msg, path_tolerances, until_trajectory};
-use crate::frames::{CameraTopics, Frame};
-use crate::node::{Command, Shared, controller_of};
+use crate::node::{Command, Shared};
 use crate::parameters::SimWorkcellParameters;
 
-/// Detects contact; only robots with software 5 or later have it.
-const TOOL_CONTACT: &str = "tool_contact_controller";
 /// How often a dead driver looks whether it was started again.
 const DEAD_PERIOD: Duration = Duration::from_millis(20);
 
@@ -47,12 +41,11 @@ pub(crate) struct Hardware {
     work_cell: WorkCell,
     commands: mpsc::Receiver<Command>,
     shared: Arc<Shared>,
-    /// Goals of `trajectory_until_node` that wait for their answer.
-    unanswered: AcceptanceQueue<NewGoal<FollowJointTrajectoryUntil>>,
+    acceptance: Acceptance,
     /// Replaces the trajectory that was under way.
     next: Option<Command>,
     /// Goals of a dead driver: nobody hears of their end.
-    orphans: Vec<Activity>,
+    orphans: Vec<Goal>,
     noise: EncoderNoise,
     /// What is wrong now.
     fault: Fault,
@@ -61,22 +54,15 @@ pub(crate) struct Hardware {
     /// Origin of the times of the wall clock, and the simulated time then.
     origin: (Instant, Duration),
     clock: Publisher<Clock>,
-    joint_states: Publisher<JointState>,
+    status: StatusPublishers,
     /// Of the arm's links.
     tf: Option<Publisher<TFMessage>>,
-    io_states: Publisher<IOStates>,
     reward: Publisher<Reward>,
     cameras: Vec<CameraTopics>,
     /// Latched.
     tf_static: Publisher<TFMessage>,
     /// Latched, said once; kept so that late joiners hear them.
     _robot_description: Option<Publisher<std_msgs::String>>,
-    robot_mode: Publisher<RobotMode>,
-    safety_mode: Publisher<SafetyMode>,
-    program_running: Publisher<Bool>,
-    tool_data: Publisher<ToolDataMsg>,
-    /// Percent.
-    speed_scaling: Publisher<Float64>,
     /// What the cameras saw at this rest: one set of frames of perfect cameras, several of noisy ones.
     frames: Vec<Vec<(usize, Frame)>>,
     /// Which set is said next.
@@ -90,14 +76,6 @@ pub(crate) struct Hardware {
     next_status: Instant,
     next_pins: Instant,
     next_frames: Instant,
-}
-
-/// Shortest and longest time until `trajectory_until_node` answers.
-fn answer_range(hardware: &HardwareSettings) -> (Duration, Duration) {
-    (
-        Duration::from_secs_f64(hardware.until_answer_min_s),
-        Duration::from_secs_f64(hardware.until_answer_max_s),
-    )
 }
 
 impl Hardware {
@@ -126,20 +104,17 @@ impl Hardware {
             }
         };
         tf_static.publish(fixed_transforms(&cell, &work_cell, &parameters)?);
-        let status = |name| format!("io_and_status_controller/{name}");
-        let range = answer_range(&parameters.hardware);
         let seed = parameters.seed;
         let origin = (Instant::now(), cell.time());
         let hardware = Self {
             // Best effort: the readers of /clock that ros2-client makes acknowledge nothing.
             clock: node.publisher("/clock", Qos::Image)?,
-            joint_states: node.publisher("joint_states", Qos::Event)?,
+            status: StatusPublishers::new(node, &work_cell.joint_names)?,
             tf: match &robot_description {
                 Some(_) => Some(node.publisher("/tf", Qos::Event)?),
                 None => None,
             },
             _robot_description: robot_description,
-            io_states: node.publisher(&status("io_states"), Qos::Event)?,
             reward: node.publisher("reward", Qos::Event)?,
             node: node.clone(),
             published_pins: cell.pins(),
@@ -151,13 +126,13 @@ impl Hardware {
             shared,
             cameras: topics,
             tf_static,
-            robot_mode: node.publisher(&status("robot_mode"), Qos::Latched)?,
-            safety_mode: node.publisher(&status("safety_mode"), Qos::Latched)?,
-            program_running: node.publisher(&status("robot_program_running"), Qos::Latched)?,
-            tool_data: node.publisher(&status("tool_data"), Qos::Event)?,
-            speed_scaling: node
-                .publisher("speed_scaling_state_broadcaster/speed_scaling", Qos::Event)?,
-            unanswered: AcceptanceQueue::new(range.0, range.1, seed),
+            acceptance: Acceptance::new(
+                Arc::clone(&shared.driver),
+                &parameters.actions(),
+                &work_cell,
+                &parameters.hardware,
+                seed,
+            ),
             next: None,
             orphans: Vec::new(),
             noise: EncoderNoise::new(seed),
@@ -193,7 +168,7 @@ impl Hardware {
             self.run_on()?;
             self.answer_goals()?;
             let next = self.next_status.min(self.next_pins).min(self.next_frames);
-            let due = self.unanswered.due().map(|due| self.origin.0 + due);
+            let due = self.acceptance.due().map(|due| self.origin.0 + due);
             let next = due.map_or(next, |due| next.min(due));
             let command = match self.next.take() {
                 Some(command) => Ok(command),
@@ -234,70 +209,34 @@ impl Hardware {
     }
 
     fn handle(&mut self, command: Command) -> anyhow::Result<()> {
-        let (arm, names) = (&self.work_cell.arm, &self.work_cell.joint_names);
-        let default_rad = self.parameters.hardware.path_tolerance_rad;
         match command {
-            Command::Follow(goal) => {
-                if let Some(reason) = self.inactive(controller_of(&self.parameters.follow_action)) {
-                    goal.reject(reason);
-                    return Ok(());
+            Command::Driver(Request::Follow(goal)) => {
+                match self.acceptance.follow(goal, self.fault) {
+                    Some((goal, motion)) => self.carry_out(goal, motion)?,
+                    None => {}
                 }
-                let (goal, running) = goal.accept();
-                let tolerances = path_tolerances(&goal.path_tolerance, names, default_rad);
-                let trajectory = follow_trajectory(&goal, arm, names);
-                self.carry_out(Activity::Follow(running), trajectory, false, &tolerances)
             }
-            Command::Until(goal) => {
-                self.unanswered.push(goal, self.now());
-                self.answer_goals()
+            Command::Driver(Request::Until(goal)) => {
+                self.acceptance.wait(goal, self.now());
+                self.answer_goals()?;
             }
-            Command::Die => {
-                self.end_driver();
-                Ok(())
-            }
-            Command::SetIo(request, reply) => {
-                self.set_io(&request, reply);
-                Ok(())
-            }
+            Command::Driver(Request::Die) => self.end_driver(),
+            Command::Driver(Request::SetIo(request, reply)) => self.set_io(&request, reply),
             Command::Reset(request, reply) => {
                 let answer = self.reset(&request)?;
                 // The caller may have gone.
                 let _ = reply.send(answer);
-                Ok(())
             }
-        }
-    }
-
-    /// Answers the goals of `trajectory_until_node` whose time has come.
-    fn answer_goals(&mut self) -> anyhow::Result<()> {
-        while let Some(answer) = self.unanswered.pop(self.now(), false) {
-            // A goal is carried out before the next one has its turn.
-            let (Answer::Accept(goal) | Answer::Busy(goal)) = answer;
-            let follow = controller_of(&self.parameters.follow_action);
-            let inactive = self
-                .inactive(follow)
-                .or_else(|| self.inactive(TOOL_CONTACT));
-            if let Some(reason) = inactive {
-                goal.reject(reason);
-                continue;
-            }
-            let (goal, running) = goal.accept();
-            let (arm, names) = (&self.work_cell.arm, &self.work_cell.joint_names);
-            let default_rad = self.parameters.hardware.path_tolerance_rad;
-            let tolerances = path_tolerances(&goal.path_tolerance, names, default_rad);
-            let trajectory = until_trajectory(&goal, arm, names);
-            self.carry_out(Activity::Until(running), trajectory, true, &tolerances)?;
         }
         Ok(())
     }
 
-    /// Why a controller takes no goals.
-    fn inactive(&self, controller: &str) -> Option<String> {
-        if !self.fault.modes().program_running {
-            return Some(format!("{controller} does not run: {:?}", self.fault));
+    /// Carries out the goals of `trajectory_until_node` whose time has come, each to its end before the next one has its turn.
+    fn answer_goals(&mut self) -> anyhow::Result<()> {
+        while let Some((goal, motion)) = self.acceptance.next(self.now(), self.fault) {
+            self.carry_out(goal, motion)?;
         }
-        let active = self.shared.controllers().is_active(controller);
-        (!active).then(|| format!("{controller} is not active"))
+        Ok(())
     }
 
     /// What can be obeyed while a goal is active. Returns what ends that goal.
@@ -305,11 +244,13 @@ impl Hardware {
         let reason = "another goal is active";
         match command {
             // A trajectory controller takes the newest.
-            Command::Follow(_) if self.parameters.hardware.strict_actions => return Some(command),
-            Command::Follow(goal) => goal.reject(reason),
-            Command::Until(goal) => self.unanswered.push(goal, self.now()),
-            Command::Die => return Some(command),
-            Command::SetIo(request, reply) => self.set_io(&request, reply),
+            Command::Driver(Request::Follow(_)) if self.parameters.hardware.strict_actions => {
+                return Some(command);
+            }
+            Command::Driver(Request::Follow(goal)) => goal.reject(reason),
+            Command::Driver(Request::Until(goal)) => self.acceptance.wait(goal, self.now()),
+            Command::Driver(Request::Die) => return Some(command),
+            Command::Driver(Request::SetIo(request, reply)) => self.set_io(&request, reply),
             Command::Reset(request, reply) => {
                 let refusal = |message| ResetCellResponse {
                     message,
@@ -321,14 +262,6 @@ impl Hardware {
             }
         }
         None
-    }
-
-    /// Rejects the goals of `trajectory_until_node` whose time has come while another goal is active.
-    fn reject_goals(&mut self) {
-        while let Some(answer) = self.unanswered.pop(self.now(), true) {
-            let (Answer::Accept(goal) | Answer::Busy(goal)) = answer;
-            goal.reject("another goal is active");
-        }
     }
 
     /// Begins an episode; only failures to speak of it are errors.
@@ -409,7 +342,7 @@ impl Hardware {
     /// The driver's process is gone: the robot stops by itself, and nobody hears of it.
     fn end_driver(&mut self) {
         self.died = true;
-        self.shared.dead.store(true, Ordering::Release);
+        self.shared.driver.set_dead(true);
     }
 
     /// The parameters that may be set at run time.
@@ -422,20 +355,17 @@ impl Hardware {
         self.parameters = parameters.borrow().clone();
         let hardware = &self.parameters.hardware;
         self.cell.set_hardware(hardware);
-        let range = answer_range(hardware);
-        self.unanswered.set_range(range.0, range.1);
+        self.acceptance.set_hardware(hardware);
         let (before, fault) = (self.fault, hardware.fault);
         if before == fault {
             return;
         }
         warn!("hardware.fault is {fault:?}, was {before:?}");
         self.fault = fault;
-        self.shared.dead.store(self.is_dead(), Ordering::Release);
+        self.shared.driver.set_dead(self.is_dead());
         if before == Fault::DriverDead && !self.died {
             // Started again, it knows nothing of what was.
-            for goal in self.unanswered.clear() {
-                goal.reject("the driver was started again");
-            }
+            self.acceptance.restart();
             while self.commands.try_recv().is_ok() {}
             self.orphans.clear();
             self.next_status = Instant::now();

@@ -4,8 +4,6 @@
 //! same states, frames and stamps, however slow the host. The wall clock decides only how often
 //! what is at rest is said again.
 
-mod driver;
-pub mod frames;
 mod hardware;
 mod node;
 mod parameters;

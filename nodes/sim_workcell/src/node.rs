@@ -1,28 +1,21 @@
-//! Services and actions of the simulated driver. What they ask is passed on to the thread of `hardware`.
+//! The node: what its services and actions ask is passed on to the thread of `hardware`.
 
+use std::convert::Infallible;
 use std::path::Path;
 use std::sync::atomic::{AtomicBool, Ordering};
-use std::sync::{Arc, Mutex, MutexGuard, PoisonError, mpsc};
+use std::sync::{Arc, mpsc};
 use std::time::SystemTime;
 
 use anyhow::Context as _;
 use camera_noise::Perturbation;
-use driver_model::{Controllers, HardwareSettings};
-use msgs::control_msgs::FollowJointTrajectory;
-use msgs::controller_manager_msgs::{
-    ControllerState, ListControllers, ListControllersResponse, SwitchController,
-    SwitchControllerResponse,
-};
+use cell_emulation::{ActionNames, DriverServer, DriverState, Request};
+use driver_model::HardwareSettings;
 use msgs::sctn_msgs::{ResetCell, ResetCellRequest, ResetCellResponse};
-use msgs::ur_msgs::{
-    FollowJointTrajectoryUntil, GetRobotSoftwareVersion, GetRobotSoftwareVersionResponse, SetIO,
-    SetIORequest, SetIOResponse,
-};
 use multiravens::Problem;
-use node_kit::{Active, NewGoal, Node};
+use node_kit::{Active, Node, ServiceServer};
 use simulated_cell::{SimulatedCell, Wiring};
 use tokio::sync::oneshot;
-use tracing::{error, warn};
+use tracing::warn;
 use ur5::WorkCell;
 
 use crate::hardware::Hardware;
@@ -65,21 +58,11 @@ pub async fn configure(
         let now = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH);
         cell.begin_at(now.context("the clock is before 1970")?);
     }
-    let controller = controller_of(&parameters.follow_action);
+    let actions = parameters.actions();
     let shared = Arc::new(Shared {
         stop: AtomicBool::new(false),
-        dead: AtomicBool::new(false),
-        controllers: Mutex::new(Controllers::new(
-            controller,
-            &behaviour.inactive_controllers,
-            behaviour.software_major,
-        )),
+        driver: Arc::new(DriverState::new(&actions, &behaviour)),
     });
-
-    let (follow_action, until_action) = (
-        parameters.follow_action.clone(),
-        parameters.until_action.clone(),
-    );
     let (sender, commands) = mpsc::sync_channel(WAITING_COMMANDS);
     let hardware = Hardware::new(
         &node,
@@ -94,35 +77,15 @@ pub async fn configure(
         sender,
         shared,
         behaviour,
-        follow_action,
-        until_action,
+        actions,
     })
-}
-
-/// The controller behind an action: the first part of its name.
-pub(crate) fn controller_of(action: &str) -> &str {
-    action
-        .trim_start_matches('/')
-        .split('/')
-        .next()
-        .unwrap_or("")
 }
 
 /// What the services and the hardware's thread share.
 pub(crate) struct Shared {
     /// The node is no longer active.
     pub(crate) stop: AtomicBool,
-    /// The driver's process is gone.
-    pub(crate) dead: AtomicBool,
-    controllers: Mutex<Controllers>,
-}
-
-impl Shared {
-    pub(crate) fn controllers(&self) -> MutexGuard<'_, Controllers> {
-        self.controllers
-            .lock()
-            .unwrap_or_else(PoisonError::into_inner)
-    }
+    pub(crate) driver: Arc<DriverState>,
 }
 
 /// The configured node. While it is inactive the cell stays as it is, and nothing is said.
@@ -132,8 +95,7 @@ pub struct HardwareNode {
     sender: mpsc::SyncSender<Command>,
     shared: Arc<Shared>,
     behaviour: HardwareSettings,
-    follow_action: String,
-    until_action: String,
+    actions: ActionNames,
 }
 
 impl Drop for HardwareNode {
@@ -145,22 +107,9 @@ impl Drop for HardwareNode {
 
 impl Active for HardwareNode {
     async fn run(&mut self, node: &Node) -> anyhow::Result<()> {
-        let mut follow = node.action_server::<FollowJointTrajectory>(&self.follow_action)?;
-        let mut until = node.action_server::<FollowJointTrajectoryUntil>(&self.until_action)?;
-        let mut set_io = node.service_server::<SetIO>("io_and_status_controller/set_io")?;
-        let mut reset = node.service_server::<ResetCell>("~/reset")?;
-        let mut list =
-            node.service_server::<ListControllers>("controller_manager/list_controllers")?;
-        let mut switch =
-            node.service_server::<SwitchController>("controller_manager/switch_controller")?;
-        let mut version = node.service_server::<GetRobotSoftwareVersion>(
-            "ur_configuration_controller/get_robot_software_version",
-        )?;
-        let repeats = self.behaviour.strict_actions.then(|| {
-            // rclcpp answers, and throws where it adds the goal to those that it has.
-            (follow.count_repeats(true), until.count_repeats(false))
-        });
-        let mut repeats = repeats.map(|(follow, _)| follow);
+        let state = Arc::clone(&self.shared.driver);
+        let mut driver = DriverServer::new(node, &self.actions, &self.behaviour, state)?;
+        let resets = node.service_server::<ResetCell>("~/reset")?;
         let hardware = self.hardware.take();
         let mut hardware = hardware.context("the hardware's thread has not ended")?;
         self.shared.stop.store(false, Ordering::Release);
@@ -168,99 +117,35 @@ impl Active for HardwareNode {
             let ended = hardware.run();
             (hardware, ended)
         });
-        let (sender, shared) = (&self.sender, &self.shared);
-        let alive = || !shared.dead.load(Ordering::Acquire);
-        loop {
-            tokio::select! {
-                goal = follow.recv() => pass_on(sender, Command::Follow(goal)),
-                goal = until.recv() => pass_on(sender, Command::Until(goal)),
-                () = repeated(&mut repeats) => {
-                    error!("a goal id has come twice: the trajectory controller's process is gone");
-                    pass_on(sender, Command::Die);
-                }
-                (id, request) = set_io.recv() => {
-                    let (reply, replied) = oneshot::channel();
-                    pass_on(sender, Command::SetIo(request, reply));
-                    tokio::select! {
-                        // Dropped where the command was not taken.
-                        success = replied => {
-                            let success = success.unwrap_or(false);
-                            set_io.respond(id, SetIOResponse { success });
-                        }
-                        // A dead driver does not answer.
-                        () = node.deactivated() => {}
-                    }
-                }
-                (id, request) = reset.recv() => {
-                    let (reply, replied) = oneshot::channel();
-                    pass_on(sender, Command::Reset(request, reply));
-                    let refused = || ResetCellResponse {
-                        message: "too many other commands wait".into(),
-                        ..Default::default()
-                    };
-                    tokio::select! {
-                        answer = replied => {
-                            reset.respond(id, answer.unwrap_or_else(|_| refused()));
-                        }
-                        () = node.deactivated() => {}
-                    }
-                }
-                (id, _) = list.recv() => if alive() {
-                    list.respond(id, controllers_of(&shared.controllers()));
-                },
-                (id, request) = switch.recv() => if alive() {
-                    let (activate, deactivate) =
-                        (&request.activate_controllers, &request.deactivate_controllers);
-                    let switched = shared.controllers().switch(activate, deactivate);
-                    switch.respond(id, SwitchControllerResponse {
-                        ok: switched.is_ok(),
-                        message: switched.err().map_or_else(String::new, |error| error.to_string()),
-                    });
-                },
-                (id, _) = version.recv() => if alive() {
-                    version.respond(id, GetRobotSoftwareVersionResponse {
-                        major: self.behaviour.software_major,
-                        ..Default::default()
-                    });
-                },
-                ended = &mut thread => {
-                    return ended.context("the hardware's thread panicked")?.1;
-                }
-                () = node.deactivated() => {
-                    self.shared.stop.store(true, Ordering::Release);
-                    let (hardware, ended) = thread.await.context("the hardware's thread panicked")?;
-                    self.hardware = Some(hardware);
-                    return ended;
-                }
+        let sender = &self.sender;
+        tokio::select! {
+            never = driver.serve(|request| pass_on(sender, Command::Driver(request))) => match never {},
+            never = serve_resets(resets, sender) => match never {},
+            ended = &mut thread => ended.context("the hardware's thread panicked")?.1,
+            () = node.deactivated() => {
+                self.shared.stop.store(true, Ordering::Release);
+                let (hardware, ended) = thread.await.context("the hardware's thread panicked")?;
+                self.hardware = Some(hardware);
+                ended
             }
         }
     }
 }
 
-/// Waits for a goal id that has come before; for ever where they are not counted.
-async fn repeated(repeats: &mut Option<tokio::sync::watch::Receiver<u64>>) {
-    if let Some(repeats) = repeats
-        && repeats.changed().await.is_ok()
-    {
-        return;
-    }
-    std::future::pending().await
-}
-
-fn controllers_of(controllers: &Controllers) -> ListControllersResponse {
-    let state = |controller: &driver_model::Controller| ControllerState {
-        name: controller.name.clone(),
-        state: if controller.is_active {
-            "active"
-        } else {
-            "inactive"
-        }
-        .to_owned(),
-        r#type: controller.class.to_owned(),
-        ..Default::default()
-    };
-    ListControllersResponse {
-        controller: controllers.list().iter().map(state).collect(),
+/// Passes resets on, one after the other.
+async fn serve_resets(
+    mut resets: ServiceServer<ResetCell>,
+    sender: &mpsc::SyncSender<Command>,
+) -> Infallible {
+    loop {
+        let (id, request) = resets.recv().await;
+        let (reply, replied) = oneshot::channel();
+        pass_on(sender, Command::Reset(request, reply));
+        let refused = |_| ResetCellResponse {
+            message: "too many other commands wait".into(),
+            ..Default::default()
+        };
+        resets.respond(id, replied.await.unwrap_or_else(refused));
     }
 }
 
@@ -273,10 +158,6 @@ fn pass_on(sender: &mpsc::SyncSender<Command>, command: Command) {
 
 /// What the services and action servers ask of the hardware's thread.
 pub(crate) enum Command {
-    Follow(NewGoal<FollowJointTrajectory>),
-    Until(NewGoal<FollowJointTrajectoryUntil>),
-    SetIo(SetIORequest, oneshot::Sender<bool>),
+    Driver(Request),
     Reset(ResetCellRequest, oneshot::Sender<ResetCellResponse>),
-    /// The driver's process ends.
-    Die,
 }

@@ -2,6 +2,7 @@
 
 use std::path::PathBuf;
 
+use cell_emulation::ActionNames;
 use driver_model::HardwareSettings;
 use node_kit::{Parameters, Range};
 use serde::{Deserialize, Serialize};
@@ -43,6 +44,16 @@ pub struct SimWorkcellParameters {
     pub perturbation: PathBuf,
     /// How the driver behaves; an ideal one by default.
     pub hardware: HardwareSettings,
+}
+
+impl SimWorkcellParameters {
+    /// Names of the motion actions.
+    pub(crate) fn actions(&self) -> ActionNames {
+        ActionNames {
+            follow: self.follow_action.clone(),
+            until: self.until_action.clone(),
+        }
+    }
 }
 
 impl Default for SimWorkcellParameters {

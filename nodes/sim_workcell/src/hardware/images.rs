@@ -3,6 +3,7 @@
 use std::time::Duration;
 
 use camera_noise::Rig;
+use cell_emulation::cameras::Frame;
 use heightmap::Camera;
 use msgs::convert::ConvertError;
 use multiravens::render::RgbdImage;
@@ -10,7 +11,6 @@ use node_kit::Level;
 use tracing::{info, warn};
 
 use super::Hardware;
-use crate::frames::Frame;
 
 /// Period of noisy cameras: 30 Hz.
 const NOISY_PERIOD: Duration = Duration::from_nanos(33_333_333);

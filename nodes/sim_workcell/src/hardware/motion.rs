@@ -3,16 +3,14 @@
 use std::thread;
 use std::time::{Duration, Instant};
 
+use cell_emulation::{End, Failure, Goal, Motion, Request};
 use msgs::control_msgs::FollowJointTrajectoryResult;
 use msgs::sctn_msgs::Reward;
 use multiravens::MotionEnd;
 use simulated_cell::Step;
 use tracing::{error, info, warn};
-use ur5::{JointTrajectory, Joints};
 
 use super::Hardware;
-use super::goal::{Activity, End, withdrawn};
-use crate::driver::Failure;
 use crate::node::Command;
 
 /// The most that simulated time catches up at once.
@@ -24,15 +22,18 @@ impl Hardware {
     /// Carries a goal out to its end.
     pub(super) fn carry_out(
         &mut self,
-        goal: Activity,
-        trajectory: Result<JointTrajectory, Failure>,
-        until_contact: bool,
-        tolerances: &Joints,
+        goal: Goal,
+        motion: Result<Motion, Failure>,
     ) -> anyhow::Result<()> {
         // Where the arm still brakes, it brakes no longer.
         self.cell.halt();
-        let begun = trajectory.and_then(|trajectory| {
-            let begun = self.cell.begin(trajectory, until_contact, tolerances);
+        let begun = motion.and_then(|motion| {
+            let Motion {
+                trajectory,
+                until_contact,
+                tolerances_rad,
+            } = motion;
+            let begun = self.cell.begin(trajectory, until_contact, &tolerances_rad);
             begun.map_err(|error| Failure::goal(error.to_string()))
         });
         if let Err(failure) = begun {
@@ -44,8 +45,7 @@ impl Hardware {
         let end = self.drive(&goal)?;
         match &end {
             End::Failed(failure) => error!("goal aborted: {failure}"),
-            End::Motion(MotionEnd::Lag) => warn!("goal aborted: the suction tip lags behind"),
-            End::Motion(_) => {}
+            End::Reached | End::Contact => {}
             End::Cancelled => info!("goal cancelled, the arm stops"),
             End::Withdrawn(failure) => warn!("goal withdrawn: {failure}"),
         }
@@ -113,7 +113,7 @@ impl Hardware {
     }
 
     /// Steps the physics to the goal's end.
-    pub(super) fn drive(&mut self, goal: &Activity) -> anyhow::Result<End> {
+    pub(super) fn drive(&mut self, goal: &Goal) -> anyhow::Result<End> {
         let begin = (Instant::now(), self.cell.time());
         let rate_hz = self.parameters.joint_states_rate_hz;
         let tick_of = |time: Duration, rate_hz: f64| (time.as_secs_f64() * rate_hz) as u64;
@@ -123,15 +123,15 @@ impl Hardware {
             while let Ok(command) = self.commands.try_recv() {
                 match self.handle_while_moving(command) {
                     None => {}
-                    Some(Command::Die) => self.end_driver(),
+                    Some(Command::Driver(Request::Die)) => self.end_driver(),
                     Some(command) => {
                         self.cell.halt();
                         self.next = Some(command);
-                        return Ok(withdrawn("a newer trajectory has come"));
+                        return Ok(End::withdrawn("a newer trajectory has come"));
                     }
                 }
             }
-            self.reject_goals();
+            self.acceptance.reject_due(self.now());
             if goal.is_cancel_requested() || self.is_stopped() {
                 self.cell.cancel();
                 return Ok(End::Cancelled);
@@ -139,18 +139,20 @@ impl Hardware {
             if self.is_dead() {
                 self.cell.cancel();
                 self.coast_unheard();
-                return Ok(withdrawn("the driver is gone"));
+                return Ok(End::withdrawn("the driver is gone"));
             }
             if !self.fault.lets_move() {
                 self.cell.cancel();
-                return Ok(withdrawn(&format!(
+                return Ok(End::withdrawn(&format!(
                     "the robot has stopped: {:?}",
                     self.fault
                 )));
             }
             match self.cell.step(self.now()) {
                 Step::Moving => {}
-                Step::Ended(end) => return Ok(End::Motion(end)),
+                Step::Ended(MotionEnd::Reached) => return Ok(End::Reached),
+                Step::Ended(MotionEnd::Contact) => return Ok(End::Contact),
+                Step::Ended(MotionEnd::Lag) => return Ok(End::Failed(lag())),
                 Step::Deviated(deviation) => {
                     self.cell.cancel();
                     let code = FollowJointTrajectoryResult::PATH_TOLERANCE_VIOLATED;
@@ -203,4 +205,13 @@ impl Hardware {
             thread::sleep(due.saturating_sub(begin.0.elapsed()));
         }
     }
+}
+
+/// The suction tip cannot follow the arm.
+fn lag() -> Failure {
+    let reason = format!(
+        "the suction tip was more than {} m behind the arm",
+        multiravens::MAX_LAG_M
+    );
+    Failure::new(FollowJointTrajectoryResult::PATH_TOLERANCE_VIOLATED, reason)
 }

@@ -2,22 +2,19 @@
 
 use std::time::Duration;
 
+use cell_emulation::Goal;
+use cell_emulation::cameras::{camera_transforms, link_transforms};
 use heightmap::Camera;
 use msgs::convert::{self, ConvertError};
 use msgs::rosgraph_msgs::Clock;
-use msgs::std_msgs::{Bool, Float64, Header};
+use msgs::std_msgs::Header;
 use msgs::tf2_msgs::TFMessage;
 use msgs::trajectory_msgs::JointTrajectoryPoint;
-use msgs::ur_dashboard_msgs::{RobotMode, SafetyMode};
-use msgs::ur_msgs::ToolDataMsg;
 use simulated_cell::SimulatedCell;
 
 use super::Hardware;
-use super::goal::Activity;
 use ur5::WorkCell;
 
-use crate::driver::pins_to_msg;
-use crate::frames::{camera_transforms, link_transforms};
 use crate::parameters::SimWorkcellParameters;
 
 /// Who commands reads the status; once nobody has for so long, it is repeated less often.
@@ -50,19 +47,9 @@ pub(super) fn fixed_transforms(
 
 impl Hardware {
     pub(super) fn publish_modes(&self) {
-        if self.is_dead() {
-            return;
+        if !self.is_dead() {
+            self.status.publish_modes(self.fault.modes());
         }
-        let modes = self.fault.modes();
-        self.robot_mode.publish(RobotMode {
-            mode: modes.robot_mode,
-        });
-        self.safety_mode.publish(SafetyMode {
-            mode: modes.safety_mode,
-        });
-        self.program_running.publish(Bool {
-            data: modes.program_running,
-        });
     }
 
     pub(super) fn header(&self) -> anyhow::Result<Header> {
@@ -83,12 +70,8 @@ impl Hardware {
         }
         let deviation_rad = self.parameters.hardware.encoder_noise_rad;
         let joints_rad = self.noise.read(&self.cell.joints_rad(), deviation_rad);
-        self.joint_states.publish(convert::joint_state_to_msg(
-            header,
-            &self.work_cell.joint_names,
-            &joints_rad,
-            &self.cell.velocities_rad_s(),
-        ));
+        self.status
+            .publish_joints(header, &joints_rad, &self.cell.velocities_rad_s());
         if let Some(tf) = &self.tf {
             tf.publish(link_transforms(
                 &self.work_cell,
@@ -105,15 +88,12 @@ impl Hardware {
         if self.is_dead() {
             return;
         }
-        self.tool_data.publish(ToolDataMsg {
-            tool_output_voltage: self.cell.tool_voltage(),
-            tool_mode: ToolDataMsg::TOOL_RUNNING_MODE,
-            ..Default::default()
-        });
-        let percent = 100.0 * self.parameters.hardware.speed_scaling;
-        self.speed_scaling.publish(Float64 { data: percent });
         self.published_pins = self.cell.pins();
-        self.io_states.publish(pins_to_msg(&self.published_pins));
+        self.status.publish_io(
+            &self.published_pins,
+            self.cell.tool_voltage(),
+            self.parameters.hardware.speed_scaling,
+        );
         self.next_pins = self.after(self.status_period_s());
     }
 
@@ -123,11 +103,7 @@ impl Hardware {
         }
     }
 
-    pub(super) fn publish_feedback(
-        &self,
-        goal: &Activity,
-        elapsed: Duration,
-    ) -> anyhow::Result<()> {
+    pub(super) fn publish_feedback(&self, goal: &Goal, elapsed: Duration) -> anyhow::Result<()> {
         let point = JointTrajectoryPoint {
             positions: self.cell.joints_rad().iter().copied().collect(),
             velocities: self.cell.velocities_rad_s().iter().copied().collect(),

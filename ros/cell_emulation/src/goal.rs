@@ -1,4 +1,4 @@
-//! A goal of one of the two trajectory actions, and how it ends.
+//! A goal of one of the two motion actions, what it asks for, and how it ends.
 
 use msgs::control_msgs::{
     FollowJointTrajectory, FollowJointTrajectoryFeedback, FollowJointTrajectoryResult,
@@ -9,40 +9,93 @@ use msgs::ur_msgs::{
     FollowJointTrajectoryUntil, FollowJointTrajectoryUntilFeedback,
     FollowJointTrajectoryUntilResult,
 };
-use multiravens::MotionEnd;
-use node_kit::RunningGoal;
+use node_kit::{NewGoal, RunningGoal};
+use ur5::{JointTrajectory, Joints, WorkCell};
 
-use crate::driver::Failure;
+use crate::trajectory::{Failure, follow_trajectory, path_tolerances, until_trajectory};
 
 /// A goal that is being carried out.
-pub(super) enum Activity {
+pub enum Goal {
+    /// Of the trajectory controller.
     Follow(RunningGoal<FollowJointTrajectory>),
+    /// Of `trajectory_until_node`.
     Until(RunningGoal<FollowJointTrajectoryUntil>),
 }
 
+/// The motion that a goal asks for.
+pub struct Motion {
+    /// Joint positions over time, within the arm's limits.
+    pub trajectory: JointTrajectory,
+    /// Whether it ends where the tool touches something.
+    pub until_contact: bool,
+    /// How far each joint may be from the trajectory; a negative tolerance allows everything.
+    pub tolerances_rad: Joints,
+}
+
 /// How a goal ends.
-pub(super) enum End {
-    Motion(MotionEnd),
+pub enum End {
+    /// The trajectory's end is reached.
+    Reached,
+    /// The tool has touched something.
+    Contact,
+    /// The driver aborts it.
     Failed(Failure),
+    /// The client has cancelled it.
     Cancelled,
     /// The driver has ended it, as its controllers do.
     Withdrawn(Failure),
 }
 
-impl Activity {
-    pub(super) fn is_cancel_requested(&self) -> bool {
+impl End {
+    /// The driver ends a goal for this reason.
+    pub fn withdrawn(reason: &str) -> Self {
+        Self::Withdrawn(Failure::goal(reason))
+    }
+}
+
+impl Goal {
+    /// Accepts a goal of the trajectory controller. A bad trajectory is accepted too, since only a result can carry the reason.
+    pub(crate) fn follow(
+        goal: NewGoal<FollowJointTrajectory>,
+        cell: &WorkCell,
+        path_tolerance_rad: f64,
+    ) -> (Self, Result<Motion, Failure>) {
+        let (goal, running) = goal.accept();
+        let names = &cell.joint_names;
+        let motion = follow_trajectory(&goal, &cell.arm, names).map(|trajectory| Motion {
+            trajectory,
+            until_contact: false,
+            tolerances_rad: path_tolerances(&goal.path_tolerance, names, path_tolerance_rad),
+        });
+        (Self::Follow(running), motion)
+    }
+
+    /// [`Self::follow`] for `trajectory_until_node`.
+    pub(crate) fn until(
+        goal: NewGoal<FollowJointTrajectoryUntil>,
+        cell: &WorkCell,
+        path_tolerance_rad: f64,
+    ) -> (Self, Result<Motion, Failure>) {
+        let (goal, running) = goal.accept();
+        let names = &cell.joint_names;
+        let motion = until_trajectory(&goal, &cell.arm, names).map(|trajectory| Motion {
+            trajectory,
+            until_contact: true,
+            tolerances_rad: path_tolerances(&goal.path_tolerance, names, path_tolerance_rad),
+        });
+        (Self::Until(running), motion)
+    }
+
+    /// Whether the client wants it to end.
+    pub fn is_cancel_requested(&self) -> bool {
         match self {
             Self::Follow(goal) => goal.is_cancel_requested(),
             Self::Until(goal) => goal.is_cancel_requested(),
         }
     }
 
-    pub(super) fn feedback(
-        &self,
-        header: Header,
-        joint_names: Vec<String>,
-        point: JointTrajectoryPoint,
-    ) {
+    /// Says where the arm is, `time_from_start` after the motion began.
+    pub fn feedback(&self, header: Header, joint_names: Vec<String>, point: JointTrajectoryPoint) {
         // The arm is where it should be.
         let error = JointTrajectoryPoint {
             positions: vec![0.0; point.positions.len()],
@@ -69,21 +122,12 @@ impl Activity {
         }
     }
 
-    pub(super) fn end(self, end: End) {
-        let lag = || {
-            Failure::new(
-                FollowJointTrajectoryResult::PATH_TOLERANCE_VIOLATED,
-                format!(
-                    "the suction tip was more than {} m behind the arm",
-                    multiravens::MAX_LAG_M
-                ),
-            )
-        };
+    /// Ends it, with the result that the driver's controllers send.
+    pub fn end(self, end: End) {
         let withdrawn = matches!(end, End::Withdrawn(_));
         let (cancelled, failure, triggered) = match end {
-            End::Motion(MotionEnd::Reached) => (false, None, false),
-            End::Motion(MotionEnd::Contact) => (false, None, true),
-            End::Motion(MotionEnd::Lag) => (false, Some(lag()), false),
+            End::Reached => (false, None, false),
+            End::Contact => (false, None, true),
             End::Failed(failure) | End::Withdrawn(failure) => (false, Some(failure), false),
             End::Cancelled => (true, None, false),
         };
@@ -124,9 +168,4 @@ impl Activity {
             }
         }
     }
-}
-
-pub(super) fn withdrawn(reason: &str) -> End {
-    let code = FollowJointTrajectoryResult::INVALID_GOAL;
-    End::Withdrawn(Failure::new(code, reason))
 }

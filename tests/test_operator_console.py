@@ -102,14 +102,18 @@ def program(launch: Process, name: str) -> int:
     raise AssertionError(f"{name} does not run")
 
 
-def slow_down(operator: Operator, factor: float) -> None:
-    """Simulated seconds for each second: a person can stop a motion only where it takes time."""
+def set_of_cell(operator: Operator, parameter: Parameter) -> None:
+    """Sets a parameter of sim_workcell while it runs."""
     client = operator.node.create_client(SetParameters, "sim_workcell/set_parameters")
     operator.until(client.service_is_ready, "sim_workcell", 30.0)
-    value = Parameter("real_time_factor", Parameter.Type.DOUBLE, factor).to_parameter_msg()
-    answer = client.call_async(SetParameters.Request(parameters=[value]))
+    answer = client.call_async(SetParameters.Request(parameters=[parameter.to_parameter_msg()]))
     operator.until(answer.done, "answer of sim_workcell", 30.0)
     assert answer.result().results[0].successful
+
+
+def slow_down(operator: Operator, factor: float) -> None:
+    """Simulated seconds for each second: a person can stop a motion only where it takes time."""
+    set_of_cell(operator, Parameter("real_time_factor", Parameter.Type.DOUBLE, factor))
 
 
 def as_arguments(parameters: dict[str, object]) -> list[str]:
@@ -470,6 +474,67 @@ def test_what_was_proposed_before_the_table_changed_cannot_be_approved_and_the_p
     ada.button("Approve").click()
     ada.reads("did it succeed")
     assert [(one.proposal_id, one.decision) for one in decided()] == [(renewed.id, StepConfirmation.APPROVE)]
+    ada.close()
+
+
+def test_the_page_shows_modes_and_the_age_of_every_stream_and_nothing_is_approved_on_what_is_stale(
+    browser: Browser, start, operator: Operator, decided
+) -> None:
+    launch, address = launch_web(start, 10004, "--processes")
+    ada = Person(browser, address, "Ada")
+    ada.takes_control()
+    ada.can("Approve")
+    robot = ada.page.get_by_role("region", name="Robot and streams")
+
+    def says(**rows: str) -> None:
+        for term, value in rows.items():
+            said = robot.get_by_role("term").filter(has_text=re.compile(f"^{term.replace('_', ' ')}$")).locator("+ dd")
+            expect(said).to_have_text(value)
+
+    says(Robot_mode="running", Safety="normal", Program="running", Speed="100 % of the planned", Suction="off", Gripper="empty")
+    for fault, mode, safety in [
+        ("protective_stop", "running", "protective stop"),
+        ("emergency_stop", "power off", "robot emergency stop"),
+        ("program_stopped", "running", "normal"),
+    ]:
+        set_of_cell(operator, Parameter("hardware.fault", Parameter.Type.STRING, fault))
+        says(Robot_mode=mode, Safety=safety, Program="not running")
+        ada.cannot("Approve")
+        expect(ada.page.get_by_role("status").filter(has_text="The robot is not ready: ")).to_be_visible()
+        set_of_cell(operator, Parameter("hardware.fault", Parameter.Type.STRING, "none"))
+        says(Robot_mode="running", Safety="normal", Program="running")
+        ada.can("Approve")
+    set_of_cell(operator, Parameter("hardware.speed_scaling", Parameter.Type.DOUBLE, 0.4))
+    says(Speed="40 % of the planned")
+
+    def age(stream: str) -> Locator:
+        return robot.get_by_role("row").filter(has=ada.page.get_by_role("rowheader", name=stream, exact=True)).get_by_role("cell")
+
+    images = [f"{side}/{image}" for side in ("front", "left", "right") for image in ("color/image_raw", "depth/image_rect_raw")]
+    stale_with = {
+        "goal_oracle": ["goal_oracle"],
+        "gctn_policy": ["gctn_policy"],
+        "suction_executor": ["suction_executor"],
+        "camera_fusion": ["camera_fusion", *images],
+        "sim_workcell": ["joint_states", *images],
+    }
+    for streams in stale_with.values():
+        for stream in streams:
+            expect(age(stream)).to_have_text(re.compile(r"^\d+\.\d s$"))
+    for node, streams in stale_with.items():
+        process = program(launch, node)
+        os.kill(process, signal.SIGSTOP)
+        for stream in streams:
+            expect(age(stream)).to_have_text(re.compile(r"^\d+\.\d s, stale$"))
+        ada.cannot("Approve")
+        assert is_greyed(ada)
+        ada.page.keyboard.press("a")
+        os.kill(process, signal.SIGCONT)
+        for stream in streams:
+            expect(age(stream)).to_have_text(re.compile(r"^\d+\.\d s$"))
+        ada.can("Approve")
+        assert not is_greyed(ada)
+    assert decided() == []
     ada.close()
 
 

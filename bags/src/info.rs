@@ -80,11 +80,11 @@ pub struct RunInfo {
 
 /// An outcome of a step in words.
 pub fn outcome_name(outcome: u8) -> &'static str {
-    StepOutcome::from_code(outcome).map_or("unknown outcome", StepOutcome::name)
+    StepOutcome::from_repr(outcome).map_or("unknown outcome", StepOutcome::name)
 }
 
 fn decision_name(decision: u8) -> &'static str {
-    OperatorDecision::from_code(decision).map_or("unknown decision", OperatorDecision::name)
+    OperatorDecision::from_repr(decision).map_or("unknown decision", OperatorDecision::name)
 }
 
 impl BagInfo {

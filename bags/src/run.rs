@@ -36,8 +36,8 @@ struct Attempt {
 
 /// Whether the arm has moved for it. What a later version may add counts as a motion.
 fn moved(result: &StepResult) -> bool {
-    let status = ProposalStatus::from_code(result.proposal_status);
-    StepOutcome::from_code(result.outcome).is_none_or(|outcome| outcome.arm_moved_for(status))
+    let status = ProposalStatus::from_repr(result.proposal_status);
+    StepOutcome::from_repr(result.outcome).is_none_or(|outcome| outcome.arm_moved_for(status))
 }
 
 /// The moment of a stamp. Stamps of before the clock's zero count as its zero.

@@ -155,7 +155,7 @@ mod tests {
 
     #[test]
     fn every_reason_of_the_oracle_has_its_own_advice() {
-        let kinds = RefusalKind::ALL.into_iter().map(Some);
+        let kinds = RefusalKind::ALL.iter().copied().map(Some);
         let all: std::collections::BTreeSet<_> = kinds.map(advice_of_oracle).collect();
         assert_eq!(all.len(), 7);
     }

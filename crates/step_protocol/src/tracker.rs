@@ -6,6 +6,7 @@ use std::time::Duration;
 
 use heightmap::Heightmap;
 use pick_place::PrimitiveSettings;
+use strum::{FromRepr, VariantArray};
 
 use crate::mutation::{Mutation, planted};
 use crate::{
@@ -85,7 +86,7 @@ impl ConfirmationRefusal {
 }
 
 /// Kinds of a [`ConfirmationRefusal`].
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, FromRepr, VariantArray)]
 #[repr(u8)]
 pub enum RefusalKind {
     /// No such proposal for the present goal.
@@ -106,24 +107,11 @@ pub enum RefusalKind {
 
 impl RefusalKind {
     /// All of them, in the order of their codes.
-    pub const ALL: [Self; 7] = [
-        Self::Unknown,
-        Self::Stale,
-        Self::Twice,
-        Self::Stopped,
-        Self::Complete,
-        Self::NoDecision,
-        Self::NotAsked,
-    ];
+    pub const ALL: &[Self] = Self::VARIANTS;
 
     /// The constant of the message `ConfirmationRefused`.
     pub const fn code(self) -> u8 {
         self as u8
-    }
-
-    /// The kind of a constant of the message `ConfirmationRefused`.
-    pub fn from_code(code: u8) -> Option<Self> {
-        Self::ALL.into_iter().find(|kind| kind.code() == code)
     }
 }
 

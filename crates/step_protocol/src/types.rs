@@ -7,6 +7,7 @@ use std::time::Duration;
 use heightmap::Heightmap;
 use nalgebra::UnitComplex;
 use pick_place::{Outcome, PickPlace, PrimitiveSettings};
+use strum::{FromRepr, VariantArray};
 
 /// Identifies a proposal; equal contents have equal ids.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, PartialOrd, Ord, Hash)]
@@ -19,7 +20,7 @@ impl fmt::Display for ProposalId {
 }
 
 /// What became of a proposal, as the executor reports it.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, FromRepr, VariantArray)]
 #[repr(u8)]
 pub enum StepOutcome {
     /// Something was picked and released at the place pose.
@@ -47,29 +48,12 @@ pub enum StepOutcome {
 }
 
 impl StepOutcome {
-    /// All outcomes, in the order of their codes.
-    pub const ALL: [Self; 11] = [
-        Self::Placed,
-        Self::NoContact,
-        Self::GraspFailed,
-        Self::Dropped,
-        Self::LagAborted,
-        Self::Refused,
-        Self::Rejected,
-        Self::Fault,
-        Self::Stopped,
-        Self::AtHome,
-        Self::NotHome,
-    ];
+    /// All of them, in the order of their codes.
+    pub const ALL: &[Self] = Self::VARIANTS;
 
     /// The constant of the message `StepResult`.
     pub const fn code(self) -> u8 {
         self as u8
-    }
-
-    /// The outcome of a constant of the message `StepResult`.
-    pub fn from_code(code: u8) -> Option<Self> {
-        Self::ALL.into_iter().find(|outcome| outcome.code() == code)
     }
 
     /// Whether the arm may have moved: heightmaps from before are no ground for another motion. The only outcomes without
@@ -137,7 +121,7 @@ impl From<Outcome> for StepOutcome {
 }
 
 /// What an operator decides.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, FromRepr, VariantArray)]
 #[repr(u8)]
 pub enum OperatorDecision {
     /// Carry the proposal out.
@@ -155,25 +139,12 @@ pub enum OperatorDecision {
 }
 
 impl OperatorDecision {
-    /// All decisions, in the order of their codes.
-    pub const ALL: [Self; 6] = [
-        Self::Approve,
-        Self::Reject,
-        Self::Advance,
-        Self::Retry,
-        Self::Stop,
-        Self::StepBack,
-    ];
+    /// All of them, in the order of their codes.
+    pub const ALL: &[Self] = Self::VARIANTS;
 
     /// The constant of the message `StepConfirmation`.
     pub const fn code(self) -> u8 {
         self as u8
-    }
-
-    /// The decision of a constant of the message `StepConfirmation`.
-    pub fn from_code(code: u8) -> Option<Self> {
-        let mut all = Self::ALL.into_iter();
-        all.find(|decision| decision.code() == code)
     }
 
     /// In words.
@@ -190,7 +161,7 @@ impl OperatorDecision {
 }
 
 /// Where a proposal stands at the executor.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Hash, FromRepr, VariantArray)]
 #[repr(u8)]
 pub enum ProposalStatus {
     /// It can be approved.
@@ -209,23 +180,11 @@ pub enum ProposalStatus {
 
 impl ProposalStatus {
     /// All of them, in the order of their codes.
-    pub const ALL: [Self; 6] = [
-        Self::Pending,
-        Self::Superseded,
-        Self::Moving,
-        Self::Done,
-        Self::Rejected,
-        Self::Withdrawn,
-    ];
+    pub const ALL: &[Self] = Self::VARIANTS;
 
     /// The constant of the message `StepResult`.
     pub const fn code(self) -> u8 {
         self as u8
-    }
-
-    /// The status of a constant of the message `StepResult`; none for 0, which recordings from before hold.
-    pub fn from_code(code: u8) -> Option<Self> {
-        Self::ALL.into_iter().find(|status| status.code() == code)
     }
 }
 
@@ -425,15 +384,15 @@ mod tests {
     #[test]
     fn codes_stand_for_what_they_are_made_of_and_nothing_else() {
         for code in 0..=u8::MAX {
-            match StepOutcome::from_code(code) {
+            match StepOutcome::from_repr(code) {
                 Some(outcome) => assert_eq!(outcome.code(), code),
                 None => assert!(!(1..=9).contains(&code)),
             }
-            match OperatorDecision::from_code(code) {
+            match OperatorDecision::from_repr(code) {
                 Some(decision) => assert_eq!(decision.code(), code),
                 None => assert!(!(1..=6).contains(&code)),
             }
-            match ProposalStatus::from_code(code) {
+            match ProposalStatus::from_repr(code) {
                 Some(status) => assert_eq!(status.code(), code),
                 None => assert!(!(1..=6).contains(&code)),
             }
@@ -442,7 +401,7 @@ mod tests {
 
     #[test]
     fn every_outcome_of_a_primitive_is_a_motion_and_comes_back() {
-        for outcome in StepOutcome::ALL {
+        for &outcome in StepOutcome::ALL {
             if let Some(motion) = outcome.motion() {
                 assert_eq!(StepOutcome::from(motion), outcome);
                 assert!(outcome.arm_moved());

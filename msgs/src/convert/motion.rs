@@ -94,7 +94,7 @@ pub fn phase_to_msg(phase: Phase) -> u8 {
 
 /// The outcome of a motion that was carried out; refused, rejected and failed ones have none.
 pub fn outcome_from_msg(outcome: u8) -> Result<Outcome, ConvertError> {
-    let motion = StepOutcome::from_code(outcome).and_then(StepOutcome::motion);
+    let motion = StepOutcome::from_repr(outcome).and_then(StepOutcome::motion);
     motion.ok_or_else(|| unexpected("outcome", outcome, "that of a motion, 1 to 5"))
 }
 

@@ -148,14 +148,14 @@ pub fn result_to_msg(
 
 /// A result with a known outcome.
 pub fn result_from_msg(msg: &sctn_msgs::StepResult) -> Result<StepResult, ConvertError> {
-    let outcome = StepOutcome::from_code(msg.outcome);
+    let outcome = StepOutcome::from_repr(msg.outcome);
     Ok(StepResult {
         stamp: time_from_msg(&msg.header.stamp)?,
         proposal_id: ProposalId(msg.proposal_id),
         outcome: outcome.ok_or_else(|| unexpected("outcome", msg.outcome, "1 to 9"))?,
         reason: msg.reason.clone(),
         duration: duration_from_msg(&msg.duration)?,
-        status: ProposalStatus::from_code(msg.proposal_status),
+        status: ProposalStatus::from_repr(msg.proposal_status),
     })
 }
 
@@ -175,7 +175,7 @@ pub fn confirmation_to_msg(
 pub fn confirmation_from_msg(
     msg: &sctn_msgs::StepConfirmation,
 ) -> Result<Confirmation, ConfirmationRefusal> {
-    let decision = OperatorDecision::from_code(msg.decision);
+    let decision = OperatorDecision::from_repr(msg.decision);
     Ok(Confirmation {
         stamp: time_from_msg(&msg.header.stamp).unwrap_or_default(),
         proposal_id: ProposalId(msg.proposal_id),
@@ -201,7 +201,7 @@ pub fn confirmation_refused_from_msg(
 ) -> (ProposalId, Option<RefusalKind>) {
     (
         ProposalId(msg.proposal_id),
-        RefusalKind::from_code(msg.reason),
+        RefusalKind::from_repr(msg.reason),
     )
 }
 
@@ -302,8 +302,8 @@ mod tests {
             let message = proposal_to_msg(&proposal).unwrap();
             assert_eq!(proposal_from_msg(&message), Ok(proposal));
         }
-        for outcome in StepOutcome::ALL {
-            for status in ProposalStatus::ALL.map(Some).into_iter().chain([None]) {
+        for &outcome in StepOutcome::ALL {
+            for status in ProposalStatus::ALL.iter().copied().map(Some).chain([None]) {
                 let result = StepResult {
                     stamp: Duration::from_secs(3),
                     proposal_id: ProposalId(7),
@@ -316,7 +316,7 @@ mod tests {
                 assert_eq!(result_from_msg(&message), Ok(result));
             }
         }
-        for decision in OperatorDecision::ALL {
+        for &decision in OperatorDecision::ALL {
             let confirmation = Confirmation {
                 stamp: Duration::from_secs(3),
                 proposal_id: ProposalId(7),

@@ -24,7 +24,11 @@ enum Event {
 
 impl Event {
     fn all() -> Vec<Self> {
-        let mut events: Vec<_> = OperatorDecision::ALL.map(Self::Decision).into();
+        let mut events: Vec<_> = OperatorDecision::ALL
+            .iter()
+            .copied()
+            .map(Self::Decision)
+            .collect();
         events.extend([
             Self::NewerProposal,
             Self::ActionCanceled,
@@ -111,10 +115,8 @@ fn tracker_table() -> String {
         );
     }
     table += "\n|---|---|---|---|---|\n";
-    for outcome in StepOutcome::ALL
-        .into_iter()
-        .filter(|outcome| !outcome.is_of_home())
-    {
+    let steps = StepOutcome::ALL.iter().filter(|one| !one.is_of_home());
+    for &outcome in steps {
         let _ = write!(table, "| `{outcome:?}` |");
         for decision in decisions {
             let _ = write!(table, " {} |", goal_after(outcome, decision));

@@ -18,6 +18,8 @@
 //! # Ok::<(), Box<dyn std::error::Error>>(())
 //! ```
 
+mod images;
+
 use std::collections::BTreeMap;
 use std::time::Duration;
 
@@ -25,6 +27,8 @@ use camera_noise::Perturbation;
 use driver_model::{HardwareSettings, PathDeviation, Servo, Vacuum};
 use multiravens::{Assessment, CellError, Environment, EnvironmentError, MotionEnd, Problem, Tick};
 use ur5::{JointTrajectory, Joints, PlanError, WorkCell};
+
+pub use self::images::{NOISY_PERIOD, Shot};
 
 /// Digital pins of a UR controller: 0 to 7 standard, 8 to 15 configurable, 16 and 17 at the tool.
 const PINS: u8 = 18;
@@ -184,6 +188,8 @@ pub struct SimulatedCell {
     rests: bool,
     /// The rewards of this rest have been told.
     assessed: bool,
+    /// Sets of images that noisy cameras have taken so far, over all episodes.
+    sets_taken: u64,
 }
 
 /// A trajectory that a servo loop follows.
@@ -239,6 +245,7 @@ impl SimulatedCell {
             followed: None,
             rests: true,
             assessed: true,
+            sets_taken: 0,
         })
     }
 
@@ -261,7 +268,11 @@ impl SimulatedCell {
             self.hardware.clone(),
         )?;
         let past = self.time() + PAUSE;
-        *self = Self { past, ..next };
+        *self = Self {
+            past,
+            sets_taken: self.sets_taken,
+            ..next
+        };
         Ok(())
     }
 

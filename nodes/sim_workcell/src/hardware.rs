@@ -67,8 +67,6 @@ pub(crate) struct Hardware {
     frames: Vec<Vec<(usize, Frame)>>,
     /// Which set is said next.
     next_set: usize,
-    /// Sets taken of noisy cameras so far.
-    sets_taken: u64,
     resets: ReplyCache<ResetCellResponse>,
     published_pins: Pins,
     /// When the last command ended.
@@ -141,7 +139,6 @@ impl Hardware {
             origin,
             frames: Vec::new(),
             next_set: 0,
-            sets_taken: 0,
             resets: ReplyCache::default(),
             last_command: Instant::now(),
             next_status: Instant::now(),

@@ -1,53 +1,11 @@
 //! Camera images: rendered when the scene rests, and published until it changes.
 
-use std::time::Duration;
-
-use camera_noise::Rig;
 use cell_emulation::cameras::Frame;
-use heightmap::Camera;
-use msgs::convert::ConvertError;
-use multiravens::render::RgbdImage;
 use node_kit::Level;
+use simulated_cell::NOISY_PERIOD;
 use tracing::{info, warn};
 
 use super::Hardware;
-
-/// Period of noisy cameras: 30 Hz.
-const NOISY_PERIOD: Duration = Duration::from_nanos(33_333_333);
-/// They run free: each takes its images this much after the one before it, so that the first and the last of three are 14 ms apart.
-const NOISY_OFFSET: Duration = Duration::from_millis(7);
-
-/// What noisy cameras take of a still scene: as many sets as their model says, one after the other, each image with noise of its own.
-pub(super) fn noisy_sets(
-    rig: &Rig,
-    cameras: &[Camera],
-    images: &[RgbdImage],
-    time: Duration,
-    taken: u64,
-) -> Result<Vec<Vec<(usize, Frame)>>, ConvertError> {
-    let mut sets = Vec::new();
-    for set in 0..rig.model().frames as u32 {
-        let mut frames = Vec::new();
-        for (index, (camera, image)) in cameras.iter().zip(images).enumerate() {
-            if rig.is_missing(index) {
-                continue;
-            }
-            let mut image = image.clone();
-            let frame = taken + u64::from(set);
-            rig.apply(
-                index,
-                &camera.intrinsics,
-                frame,
-                &mut image.rgb,
-                &mut image.depth_m,
-            );
-            let stamp = time + set * NOISY_PERIOD + index as u32 * NOISY_OFFSET;
-            frames.push((index, Frame::new(camera, &image, stamp)?));
-        }
-        sets.push(frames);
-    }
-    Ok(sets)
-}
 
 impl Hardware {
     /// Renders the cameras' frames and publishes them.
@@ -80,21 +38,14 @@ impl Hardware {
 
     /// Renders what the cameras see now.
     pub(super) fn render(&mut self) -> anyhow::Result<()> {
-        let time = self.cell.time();
-        let rig = self.cell.environment().rig().cloned();
-        let cell = self.cell.environment_mut().cell_mut();
-        let cameras = cell.cameras().to_vec();
-        let images = cell.render()?;
-        self.frames = match &rig {
-            None => {
-                let frames = cameras.iter().zip(images).enumerate();
-                let frames = frames
-                    .map(|(index, (camera, image))| Ok((index, Frame::new(camera, image, time)?)));
-                vec![frames.collect::<Result<_, ConvertError>>()?]
-            }
-            Some(rig) => noisy_sets(rig, &cameras, images, time, self.sets_taken)?,
-        };
-        self.sets_taken += self.frames.len() as u64;
+        let mut frames: Vec<Vec<_>> = Vec::new();
+        self.cell.take_images(|shot| {
+            frames.resize_with(shot.set + 1, Vec::new);
+            let frame = Frame::new(shot.camera, shot.image, shot.time)?;
+            frames[shot.set].push((shot.index, frame));
+            anyhow::Ok(())
+        })?;
+        self.frames = frames;
         self.next_set = 0;
         Ok(())
     }

@@ -4,7 +4,6 @@ use std::time::Duration;
 
 use cell_emulation::Goal;
 use cell_emulation::cameras::{camera_transforms, link_transforms};
-use heightmap::Camera;
 use msgs::convert::{self, ConvertError};
 use msgs::rosgraph_msgs::Clock;
 use msgs::std_msgs::Header;
@@ -28,16 +27,8 @@ pub(super) fn fixed_transforms(
     work_cell: &WorkCell,
     parameters: &SimWorkcellParameters,
 ) -> Result<TFMessage, ConvertError> {
-    let environment = cell.environment();
-    let cameras = environment.cell().cameras().iter().enumerate();
-    let believed: Vec<Camera> = cameras
-        .map(|(index, camera)| match environment.rig() {
-            Some(rig) => rig.believed(index, camera),
-            None => camera.clone(),
-        })
-        .collect();
     let (world, time) = (&parameters.world_frame, cell.time());
-    let mut fixed = camera_transforms(&believed, world, time)?;
+    let mut fixed = camera_transforms(&cell.calibrated_cameras(), world, time)?;
     if parameters.publish_robot {
         let links = link_transforms(work_cell, &work_cell.arm.home, false, world, time)?;
         fixed.transforms.extend(links.transforms);

@@ -4,7 +4,7 @@ use crate::cell::{Cell, CellError, Rehearsal, Watched};
 use crate::problem::Problem;
 use crate::render::{LIGHT, RenderError, RgbdImage};
 use crate::seed::{Draws, EpisodeSeed, stream};
-use crate::tasks::{Move, ParameterError, Task};
+use crate::tasks::{Care, Demonstrator, Move, ParameterError, Task};
 use camera_noise::{ClutterItem, Perturbation, Rig};
 use heightmap::{
     Camera, Fusion, FusionError, Heightmap, StillFusion, StillSettings, View, Workspace,
@@ -35,7 +35,7 @@ pub struct Environment {
     problem: Problem,
     cell: Cell,
     tasks: Vec<Progress>,
-    demonstrator: ChaCha8Rng,
+    demonstrator: Demonstrator,
     disturber: ChaCha8Rng,
     /// What the demonstrator's last action does in the present state, if it has rehearsed it.
     cached_rehearsal: Option<(PickPlace, Rehearsal)>,
@@ -200,7 +200,7 @@ impl Environment {
             problem: problem.clone(),
             cell: Cell::new(work_cell),
             tasks: Vec::new(),
-            demonstrator: stream(0, DEMONSTRATOR_STREAM),
+            demonstrator: stream(0, DEMONSTRATOR_STREAM).into(),
             disturber: stream(0, DISTURBANCE_STREAM),
             cached_rehearsal: None,
             order: Vec::new(),
@@ -282,7 +282,7 @@ impl Environment {
         self.tasks.clear();
         self.cell.clear();
         self.cached_rehearsal = None;
-        self.demonstrator = stream(seed.start, DEMONSTRATOR_STREAM);
+        self.demonstrator.rng = stream(seed.start, DEMONSTRATOR_STREAM);
         self.disturber = stream(seed.start, DISTURBANCE_STREAM);
         for (index, placement) in self.problem.modules().iter().enumerate() {
             let mut draws = Draws::new(seed, index as u64);
@@ -327,6 +327,11 @@ impl Environment {
         }
         perturbed.fusion.median(&mut self.heightmap);
         Ok(&self.heightmap)
+    }
+
+    /// Tells the demonstrator, for all episodes from now on, how sure to make of what it rehearses.
+    pub fn set_care(&mut self, care: Care) {
+        self.demonstrator.care = care;
     }
 
     /// Tells the demonstrator, until the next reset, in which order to reach the goals, numbered as in

@@ -15,4 +15,4 @@ pub use cell::{Cell, CellError, MAX_LAG_M, MotionEnd, Rehearsal, Tick, Watched};
 pub use environment::{Assessment, Environment, EnvironmentError, StepReport};
 pub use problem::{Placement, Problem, ProblemError};
 pub use seed::{Draws, EpisodeSeed};
-pub use tasks::{Move, Task, TaskModule};
+pub use tasks::{Care, Demonstrator, Move, Task, TaskModule};

@@ -8,7 +8,9 @@
 //! Peg frame: origin half-way between the pegs, x from one to the other, the chain starts on the
 //! side of -y.
 
-use super::{Move, ParameterError, Task, TaskModule, at_height, check_range, rehearsed};
+use super::{
+    Demonstrator, Move, ParameterError, Task, TaskModule, at_height, check_range, rehearsed,
+};
 use crate::cell::Cell;
 use crate::colors;
 use crate::seed::Draws;
@@ -424,7 +426,7 @@ impl Task for ChainingTask {
     fn demonstrate(
         &mut self,
         cell: &Cell,
-        rng: &mut ChaCha8Rng,
+        demonstrator: &mut Demonstrator,
         next: Option<usize>,
     ) -> Option<Move> {
         let world = cell.world();
@@ -447,7 +449,7 @@ impl Task for ChainingTask {
                 place: pose(place),
             })
         };
-        rehearsed(cell, &SETTINGS, rng, guess, next, |world| {
+        rehearsed(cell, &SETTINGS, demonstrator, guess, next, |world| {
             self.wrapped(world)
         })
     }
@@ -526,7 +528,7 @@ mod tests {
         rest(&mut world);
         assert_eq!(task.reached(&world), 2);
         let mut rng = ChaCha8Rng::seed_from_u64(0);
-        let next = task.demonstrate(&Cell::around(&world), &mut rng, None);
+        let next = task.demonstrate(&Cell::around(&world), &mut rng.into(), None);
         assert!(next.is_none());
     }
 
@@ -680,7 +682,7 @@ mod tests {
         let before = world.state_hash();
         let actions = [0, 0, 1].map(|seed| {
             let mut rng = ChaCha8Rng::seed_from_u64(seed);
-            task.demonstrate(&Cell::around(&world), &mut rng, None)
+            task.demonstrate(&Cell::around(&world), &mut rng.into(), None)
                 .map(|next| next.action)
         });
         assert_eq!(actions[0], actions[1]);

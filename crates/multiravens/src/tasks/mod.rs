@@ -119,9 +119,54 @@ pub trait Task: Send {
     fn demonstrate(
         &mut self,
         cell: &Cell,
-        rng: &mut ChaCha8Rng,
+        demonstrator: &mut Demonstrator,
         next: Option<usize>,
     ) -> Option<Move>;
+}
+
+/// Who demonstrates: what it draws its actions from, and how sure it makes of those that it rehearses.
+#[derive(Debug, Clone)]
+pub struct Demonstrator {
+    /// Stream that all choices are drawn from.
+    pub rng: ChaCha8Rng,
+    /// How far a rehearsed move may be missed.
+    pub care: Care,
+}
+
+impl From<ChaCha8Rng> for Demonstrator {
+    fn from(rng: ChaCha8Rng) -> Self {
+        let care = Care::default();
+        Self { rng, care }
+    }
+}
+
+/// How sure a demonstrator makes of the moves that it rehearses, those of chains and cables, before it makes one.
+#[derive(Debug, Clone, Copy, PartialEq, Eq, Default)]
+pub enum Care {
+    /// A move succeeds in two rehearsals within 1 mm of what is meant.
+    #[default]
+    Usual,
+    /// A move succeeds once as it is made and in four more rehearsals, gripped and set down within 6 mm of what is meant:
+    /// what a policy that grips a little beside would achieve too.
+    Careful,
+}
+
+impl Care {
+    /// Rehearsals, each with other noise, in which a move has to succeed.
+    fn rehearsals(self) -> usize {
+        match self {
+            Self::Usual => 2,
+            Self::Careful => 5,
+        }
+    }
+
+    /// Noise along x and y of the rehearsals after the first.
+    fn noise_m(self) -> f64 {
+        match self {
+            Self::Usual => NOISE_M,
+            Self::Careful => 6e-3,
+        }
+    }
 }
 
 /// A demonstrator's action.
@@ -143,8 +188,6 @@ impl From<PickPlace> for Move {
 
 /// Moves that a demonstrator rehearses at most before it takes the best of them.
 const GUESSES: usize = 20;
-/// Rehearsals, each with other noise, in which a move has to succeed.
-const REHEARSALS: usize = 2;
 /// A demonstrator grips and sets down within this distance of what it means along x and y.
 const NOISE_M: f64 = 1e-3;
 
@@ -157,11 +200,13 @@ const NOISE_M: f64 = 1e-3;
 fn rehearsed(
     cell: &Cell,
     settings: &PrimitiveSettings,
-    rng: &mut ChaCha8Rng,
+    demonstrator: &mut Demonstrator,
     mut guess: impl FnMut(usize, &mut ChaCha8Rng) -> Option<PickPlace>,
     next: Option<usize>,
     reached: impl Fn(&World) -> Vec<usize>,
 ) -> Option<Move> {
+    let Demonstrator { rng, care } = demonstrator;
+    let rehearsals = care.rehearsals();
     let before = reached(cell.world()).len();
     let succeeds = |after: &Vec<usize>| {
         after.len() == before + 1 && next.is_none_or(|goal| after.contains(&goal))
@@ -172,10 +217,14 @@ fn rehearsed(
         let Some(meant) = guess(index, rng) else {
             break;
         };
-        let moves = [(); REHEARSALS].map(|()| PickPlace {
-            pick: near(&meant.pick, rng),
-            place: near(&meant.place, rng),
-        });
+        let mut moves = Vec::with_capacity(rehearsals);
+        for index in 0..rehearsals {
+            let noise_m = if index == 0 { NOISE_M } else { care.noise_m() };
+            moves.push(PickPlace {
+                pick: near(&meant.pick, noise_m, rng),
+                place: near(&meant.place, noise_m, rng),
+            });
+        }
         let mut good = 0;
         let mut gains = false;
         let mut first = Move::from(moves[0]);
@@ -197,16 +246,16 @@ fn rehearsed(
         if best.as_ref().is_none_or(|(most, _)| (good, gains) > *most) {
             best = Some(((good, gains), first));
         }
-        if good == REHEARSALS {
+        if good == rehearsals {
             break;
         }
     }
     best.map(|(_, best)| best)
 }
 
-/// A pose with noise.
-fn near(pose: &Isometry2<f64>, rng: &mut ChaCha8Rng) -> Isometry2<f64> {
-    let mut noise = || rng.random_range(-NOISE_M..NOISE_M);
+/// A pose with noise along x and y.
+fn near(pose: &Isometry2<f64>, noise_m: f64, rng: &mut ChaCha8Rng) -> Isometry2<f64> {
+    let mut noise = || rng.random_range(-noise_m..noise_m);
     Isometry2::new(
         pose.translation.vector + Vector2::new(noise(), noise()),
         pose.rotation.angle(),

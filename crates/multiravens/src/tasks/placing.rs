@@ -7,7 +7,7 @@
 //!
 //! Module frame: x along the table's short side when the anchor's yaw is 0; left is +y.
 
-use super::{Move, ParameterError, Task, TaskModule, at_height, check_range};
+use super::{Demonstrator, Move, ParameterError, Task, TaskModule, at_height, check_range};
 use crate::colors;
 use crate::seed::Draws;
 use crate::world::{BodyId, Mobility, Part, Shape, World};
@@ -318,9 +318,10 @@ impl Task for PlacingTask {
     fn demonstrate(
         &mut self,
         cell: &crate::Cell,
-        rng: &mut ChaCha8Rng,
+        demonstrator: &mut Demonstrator,
         next: Option<usize>,
     ) -> Option<Move> {
+        let rng = &mut demonstrator.rng;
         let world = cell.world();
         let mut moves = Vec::new();
         for disk in &self.disks {
@@ -406,7 +407,7 @@ mod tests {
             assert_eq!(task.reached(&world), count + 1);
         }
         let mut rng = ChaCha8Rng::seed_from_u64(0);
-        let next = task.demonstrate(&crate::Cell::around(&world), &mut rng, None);
+        let next = task.demonstrate(&crate::Cell::around(&world), &mut rng.into(), None);
         assert!(next.is_none());
     }
 
@@ -524,7 +525,7 @@ mod tests {
             let (world, mut task) = scene(seed);
             let mut rng = ChaCha8Rng::seed_from_u64(seed);
             let cell = crate::Cell::around(&world);
-            let action = task.demonstrate(&cell, &mut rng, None).unwrap().action;
+            let action = task.demonstrate(&cell, &mut rng.into(), None).unwrap().action;
             let pick = Point2::from(action.pick.translation.vector);
             let disk = task.disks.iter().find(|d| {
                 (world.position(d.body).xy() - pick).norm() <= 0.25 * d.radius_m + 1e-9

@@ -8,7 +8,9 @@
 //!
 //! Module frame: the cable runs along +x; the far side is +y, the side on which it starts -y.
 
-use super::{Move, ParameterError, Task, TaskModule, at_height, check_range, field, rehearsed};
+use super::{
+    Demonstrator, Move, ParameterError, Task, TaskModule, at_height, check_range, field, rehearsed,
+};
 use crate::cell::Cell;
 use crate::colors;
 use crate::seed::Draws;
@@ -439,7 +441,7 @@ impl Task for RoutingTask {
     fn demonstrate(
         &mut self,
         cell: &Cell,
-        rng: &mut ChaCha8Rng,
+        demonstrator: &mut Demonstrator,
         next: Option<usize>,
     ) -> Option<Move> {
         let beads = self.beads(cell.world());
@@ -462,7 +464,7 @@ impl Task for RoutingTask {
             })
         };
         let reached = |world: &World| (0..self.count(&self.beads(world))).collect();
-        rehearsed(cell, &self.settings(), rng, guess, next, reached)
+        rehearsed(cell, &self.settings(), demonstrator, guess, next, reached)
     }
 }
 

@@ -7,7 +7,7 @@
 //!
 //! Module frame: the stand is at -x, the array at +x.
 
-use super::{Move, ParameterError, Task, TaskModule, at_height, check_range};
+use super::{Demonstrator, Move, ParameterError, Task, TaskModule, at_height, check_range};
 use crate::cell::Cell;
 use crate::colors;
 use crate::seed::Draws;
@@ -324,9 +324,10 @@ impl Task for StackingTask {
     fn demonstrate(
         &mut self,
         cell: &Cell,
-        rng: &mut ChaCha8Rng,
+        demonstrator: &mut Demonstrator,
         next: Option<usize>,
     ) -> Option<Move> {
+        let rng = &mut demonstrator.rng;
         let world = cell.world();
         let next = next.map(|next| self.goals[next].block);
         let row = self.row(world)?.iter().filter(|goal| {
@@ -414,7 +415,7 @@ mod tests {
             assert_eq!(task.reached(&world), goal + 1);
         }
         let mut rng = ChaCha8Rng::seed_from_u64(0);
-        let next = task.demonstrate(&Cell::around(&world), &mut rng, None);
+        let next = task.demonstrate(&Cell::around(&world), &mut rng.into(), None);
         assert!(next.is_none());
     }
 
@@ -439,7 +440,7 @@ mod tests {
         assert_eq!(task.reached(&world), 2);
         // There is no way to go on but to take the tower down, from its top.
         let mut rng = ChaCha8Rng::seed_from_u64(0);
-        let next = task.demonstrate(&Cell::around(&world), &mut rng, None);
+        let next = task.demonstrate(&Cell::around(&world), &mut rng.into(), None);
         let pick = next.unwrap().action.pick.translation.vector;
         let top = world.position(task.goals[4].block).xy();
         assert!((pick - top.coords).norm() < 1e-6);
@@ -580,7 +581,7 @@ mod tests {
             let (mut world, mut task) = scene(seed);
             let mut rng = ChaCha8Rng::seed_from_u64(seed);
             let cell = Cell::around(&world);
-            let action = task.demonstrate(&cell, &mut rng, None).unwrap().action;
+            let action = task.demonstrate(&cell, &mut rng.into(), None).unwrap().action;
             let turn = action.place.rotation.angle();
             prop_assert!(turn.abs() < FRAC_PI_4 + 0.01);
             let goal = task.goals[..3].iter().find(|goal| {

@@ -12,7 +12,7 @@ pub mod description;
 pub mod generator;
 mod solid;
 
-use super::{Move, ParameterError, Task, TaskModule, check_range, field};
+use super::{Demonstrator, Move, ParameterError, Task, TaskModule, check_range, field};
 use crate::cell::Cell;
 use crate::seed::Draws;
 use crate::world::{BodyId, Mobility, Part, World};
@@ -902,9 +902,10 @@ impl Task for ArrangingTask {
     fn demonstrate(
         &mut self,
         cell: &Cell,
-        rng: &mut ChaCha8Rng,
+        demonstrator: &mut Demonstrator,
         next: Option<usize>,
     ) -> Option<Move> {
+        let rng = &mut demonstrator.rng;
         let world = cell.world();
         let on_goals = self.on_goals(world);
         let mut moves = Vec::new();

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import json
+import math
 import pathlib
 
 import pytest
-from processes import Process, free_domain
+from bag_contents import contents
+from processes import REPOSITORY, Process, free_domain
+from sctn_msgs.msg import StepResult
 
 # Some of these episodes fail at a step and go on.
 FIRST_SEED = {"chaining": 10000, "routing": 10020}
@@ -34,3 +37,23 @@ def test_an_episode_has_the_same_outcome_in_the_graph_as_in_the_evaluation(start
         outcome = json.loads(graphs[number].output().splitlines()[-1])
         graph = (outcome["completed"], outcome["reward"], outcome["steps"])
         assert graph == (episode["completed"], pytest.approx(episode["reward"]), episode["steps"]), episode["seed"]
+
+
+def test_a_pick_that_has_just_failed_is_not_proposed_again(start, tmp_path: pathlib.Path) -> None:
+    """Of a scene in which six identical picks failed, one after the other."""
+    checkpoint = REPOSITORY / "config/checkpoints/ten_problems.safetensors"
+    scene = ("--problem", "stacking_routing", "--seed", 731_010, "--checkpoint", checkpoint)
+    launch = start("sctn", "launch", *scene, "--operator", "auto", "--record", tmp_path / "run")
+    assert launch.wait(400.0) == 0, launch.log()
+    assert "completed after" in launch.output()
+    proposed = failed = None
+    failures = 0
+    for topic, message in contents(tmp_path / "run/run", "/pick_place", "/step_result"):
+        if topic == "/step_result":
+            if message.outcome in (StepResult.GRASP_FAILED, StepResult.NO_CONTACT):
+                failed, failures = proposed, failures + 1
+        else:
+            if failed is not None and message.step == failed.step:
+                assert math.dist((message.pick.x, message.pick.y), (failed.pick.x, failed.pick.y)) > 0.005
+            failed, proposed = None, message
+    assert failures > 0, "no pick has failed: the scene shows nothing any more"

@@ -186,7 +186,8 @@ def full_disk(bench: Bench) -> None:
     """The recorder's disk is full: it ends and says why, and the arm can be stopped."""
     full = ["sh", "-c", f"trap '' XFSZ; ulimit -f {DISK_BLOCKS}; exec \"$@\"", "sh"]
     recorder = bench.start("sctn", "bag", "record", "--all", "--out", bench.logs / f"bag-{time.monotonic()}", prefix=full)
-    end = time.monotonic() + 10.0
+    # It finds the graph first, which takes its time on a busy machine.
+    end = time.monotonic() + 40.0
     while recorder.exit_code is None and time.monotonic() < end:
         bench.cell.repeat_heightmap(bench.cell.newest_heightmap)
         bench.operator.spin(0.1)

@@ -16,7 +16,7 @@ use msgs::sctn_msgs::{ConfirmationRefused, Goal, PickPlace, Reward, StepConfirma
 use multiravens::{Environment, EpisodeSeed, Problem};
 use node_kit::{Node, Qos, ns_from_stamp, plain_node, wait_for_end};
 use operator::{OperatorKind, Prompt, RequireApproval, confirmation, described};
-use recording::{LAST_HEIGHTMAP, LAST_WORDS, RunRecorder};
+use recording::{LAST_HEIGHTMAP, LAST_WORDS, LAST_WORDS_ELSEWHERE, RunRecorder};
 use serde::Serialize;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
@@ -306,7 +306,11 @@ impl Launch {
             let measured_ns = ended.is_ok().then_some(desk.measured_ns);
             recorder.last_words(measured_ns).await;
         }
-        tokio::time::sleep(LAST_WORDS).await;
+        let last_words = match self.operator {
+            OperatorKind::None => LAST_WORDS_ELSEWHERE,
+            _ => LAST_WORDS,
+        };
+        tokio::time::sleep(last_words).await;
         graph.stop(&context).await;
         let bag = match recorder {
             Some(recorder) => {

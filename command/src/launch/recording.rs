@@ -20,6 +20,9 @@ use std::time::Duration;
 const CAMERAS: [&str; 3] = ["front", "left", "right"];
 /// What was sent last may still be on its way, or have to be sent again: who sent it must live so long.
 pub const LAST_WORDS: Duration = Duration::from_millis(500);
+/// The same where the operator is a program of others: Fast DDS drops what its reader has not taken yet when the writer leaves, and a program on
+/// a busy machine may be late.
+pub const LAST_WORDS_ELSEWHERE: Duration = Duration::from_secs(2);
 /// How long the desk may take to find the recorder.
 const DISCOVERY: Duration = Duration::from_secs(20);
 /// How long what shows the end of the run may take: images are best effort, and said again twice a second.

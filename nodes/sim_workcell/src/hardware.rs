@@ -103,6 +103,13 @@ impl Hardware {
         };
         tf_static.publish(fixed_transforms(&cell, &work_cell, &parameters)?);
         let seed = parameters.seed;
+        let acceptance = Acceptance::new(
+            Arc::clone(&shared.driver),
+            &parameters.actions(),
+            &work_cell,
+            &parameters.hardware,
+            seed,
+        );
         let origin = (Instant::now(), cell.time());
         let hardware = Self {
             // Best effort: the readers of /clock that ros2-client makes acknowledge nothing.
@@ -124,13 +131,7 @@ impl Hardware {
             shared,
             cameras: topics,
             tf_static,
-            acceptance: Acceptance::new(
-                Arc::clone(&shared.driver),
-                &parameters.actions(),
-                &work_cell,
-                &parameters.hardware,
-                seed,
-            ),
+            acceptance,
             next: None,
             orphans: Vec::new(),
             noise: EncoderNoise::new(seed),

@@ -12,8 +12,10 @@ pub enum InvalidRequest {
         flag = SetIORequest::FUN_SET_FLAG,
         voltage = SetIORequest::FUN_SET_TOOL_VOLTAGE
     )]
+    /// A function that the driver does not have.
     Function(i8),
     #[error(transparent)]
+    /// A pin, level or voltage that there is not.
     Output(#[from] InvalidOutput),
 }
 

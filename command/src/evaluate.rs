@@ -6,7 +6,7 @@ use crate::root::Root;
 use anyhow::{Context, Result, bail};
 use camera_noise::Perturbation;
 use clap::{Args, ValueEnum};
-use gctn::Policy;
+use gctn::{Device, Policy, Precision};
 use heightmap::picture::{self, RgbImage};
 use learning::{Actor, Attempt, Episodes, Evaluation, Start, evaluate, goal};
 use std::path::PathBuf;
@@ -37,6 +37,9 @@ pub struct Evaluate {
     /// What the cameras do to observations and goals, a file as those of config/perturbations [default: perfect cameras]
     #[arg(long)]
     perturb: Option<PathBuf>,
+    /// Where the policy computes: cpu, cuda or cuda:N
+    #[arg(long, default_value_t)]
+    device: Device,
     /// Episodes at a time [default: one per core]
     #[arg(long)]
     threads: Option<usize>,
@@ -83,6 +86,7 @@ impl From<StartArgument> for Start {
 
 impl Evaluate {
     pub fn run(self, root: &Root) -> Result<()> {
+        self.device.check()?;
         let problem = root.problem(&self.problem)?;
         let work_cell = root.work_cell()?;
         let perturbation = self.perturb.as_deref().map(Perturbation::load);
@@ -94,7 +98,11 @@ impl Evaluate {
         let mut actors: Vec<_> = (0..self.threads.unwrap_or(cores).max(1))
             .map(|_| match self.baseline {
                 Some(Baseline::Difference) => Ok(Actor::Difference),
-                None => Ok(Actor::from(Policy::load(&checkpoint)?)),
+                None => Ok(Actor::from(Policy::load_for(
+                    &checkpoint,
+                    self.device,
+                    Precision::F32,
+                )?)),
             })
             .collect::<Result<_>>()?;
         let plan = Episodes {

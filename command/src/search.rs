@@ -101,7 +101,7 @@ impl SearchCommand {
             demos: std::slice::from_ref(&self.demos),
             held_out: &[],
         };
-        let snapshots = train(root, recipe.clone(), data, &folder, &shown, resume)?;
+        let snapshots = train(root, recipe.clone(), data, &folder, &shown, resume, None)?;
         let episodes = recipe.validation.episodes;
         let first = |rates: &BTreeMap<String, f64>| rates.values().next().copied().unwrap_or(0.0);
         let snapshots = snapshots.iter().map(|snapshot| TrialSnapshot {

@@ -3,11 +3,11 @@
 use crate::cluster::{Engine, Jobs};
 use crate::progress;
 use crate::root::Root;
-use crate::train::{Data, Snapshot, train};
+use crate::train::{Data, Snapshot, decider, train};
 use anyhow::{Context, Result, ensure};
 use clap::Args;
 use cpu_time::ProcessTime;
-use gctn::{Device, Policy, TrainingConfig};
+use gctn::{Device, TrainingConfig};
 use learning::{
     Actor, Episodes, Recipe, Run, RunResult, Score, SnapshotResult, Start, Sweep, evaluate,
     wilson_95,
@@ -34,6 +34,9 @@ pub struct SweepCommand {
     /// List the runs, and do nothing
     #[arg(long)]
     list: bool,
+    /// Where trainings, validation and tests compute, in place of the sweep's: cpu, cuda or cuda:N
+    #[arg(long)]
+    device: Option<Device>,
     /// Where to run: here, one run after the other, or each as a job of its own on a cluster whose hosts share all files
     #[arg(long, value_enum, default_value_t)]
     engine: Engine,
@@ -57,7 +60,13 @@ fn part(text: &str) -> Result<(usize, usize), String> {
 
 impl SweepCommand {
     pub fn run(self, root: &Root) -> Result<()> {
-        let sweep = Sweep::load(&self.sweep)?;
+        let mut sweep = Sweep::load(&self.sweep)?;
+        if let Some(device) = self.device {
+            sweep.training.device = device;
+        }
+        if self.engine == Engine::Local && !self.list {
+            sweep.training.device.check()?;
+        }
         // Problems are read before anything is trained.
         let mut modules = std::collections::BTreeMap::new();
         for name in &sweep.problems {
@@ -121,7 +130,7 @@ impl SweepCommand {
             Ok(text.to_owned())
         };
         let program = std::env::current_exe().context("path of the program")?;
-        let command = [
+        let mut command = vec![
             absolute(&program)?,
             "--root".into(),
             absolute(&root.join(""))?,
@@ -132,15 +141,18 @@ impl SweepCommand {
             absolute(&self.demos)?,
             "--out".into(),
             absolute(&self.out)?,
-            "--part".into(),
         ];
+        if let Some(device) = self.device {
+            command.extend(["--device".into(), device.to_string()]);
+        }
+        command.push("--part".into());
         Ok(Jobs {
-            command: command.to_vec(),
+            command,
             parts,
             cores: sweep.training.threads,
             gpus: self.gpus.unwrap_or(match sweep.training.device {
                 Device::Cpu => 0.0,
-                Device::Cuda => 1.0,
+                Device::Cuda(_) => 1.0,
             }),
             logs: self.out.join("slurm"),
         })
@@ -198,13 +210,14 @@ impl SweepCommand {
             folder,
             &self.shown(),
             resume,
+            None,
         )?;
         let problem = root.problem(&run.problem)?;
         let work_cell = root.work_cell()?;
         let score = |snapshot: &Snapshot, seed: u64, episodes: usize| -> Result<Score> {
             gctn::set_threads(1);
             let mut actors = (0..recipe.training.threads)
-                .map(|_| Ok(Actor::from(Policy::load(&snapshot.checkpoint)?)))
+                .map(|_| Ok(Actor::from(decider(&snapshot.checkpoint, &recipe)?)))
                 .collect::<Result<Vec<_>>>()?;
             let plan = Episodes {
                 first_seed: seed,
@@ -288,7 +301,7 @@ fn device(training: &TrainingConfig) -> String {
     let precision = training.precision.on(training.device);
     match training.device {
         Device::Cpu => format!("{}, {precision}", processor()),
-        Device::Cuda => format!("a CUDA card beside {}, {precision}", processor()),
+        Device::Cuda(_) => format!("a CUDA card beside {}, {precision}", processor()),
     }
 }
 

@@ -7,7 +7,7 @@ use crate::root::Root;
 use anyhow::{Context, Result, bail};
 use bags::Demonstration;
 use clap::Args;
-use gctn::{GoalConditioning, ModelCard, Policy};
+use gctn::{Device, GoalConditioning, ModelCard, Policy, Precision};
 use indicatif::HumanDuration;
 use learning::{
     Actor, DataSet, Demonstrations, Episodes, EventFile, ImageMemory, Recipe, Start, Training,
@@ -17,6 +17,7 @@ use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
 use std::io::Write;
 use std::path::{Path, PathBuf};
+use std::time::{Duration, Instant};
 
 /// Gradient steps between lines of progress where there is no terminal.
 const LOG_EVERY: u64 = 10;
@@ -49,6 +50,13 @@ pub struct Train {
     /// Checkpoint to begin with in place of the recipe's; its network is used
     #[arg(long)]
     start_from: Option<PathBuf>,
+    /// Where to compute, validation too, in place of the recipe's: cpu, cuda or cuda:N
+    #[arg(long)]
+    device: Option<Device>,
+    /// Stop after the gradient step during which so many seconds have passed since the command began: what is there then is
+    /// validated and kept as at the end, and --resume goes on from it, to the same policy as without a stop
+    #[arg(long, value_name = "SECONDS", value_parser = seconds)]
+    deadline: Option<Duration>,
     /// Go on with the training in that folder
     #[arg(long)]
     resume: bool,
@@ -69,6 +77,16 @@ pub struct Snapshot {
     pub completion: BTreeMap<String, f64>,
     /// Mean reward of each problem.
     pub reward: BTreeMap<String, f64>,
+    /// Taken only because the deadline had passed: a training that goes on forgets it.
+    #[serde(default, skip_serializing_if = "std::ops::Not::not")]
+    pub at_deadline: bool,
+}
+
+/// A time of 0 s or more.
+fn seconds(text: &str) -> Result<Duration, String> {
+    let seconds = text.parse().ok();
+    let duration = seconds.and_then(|seconds| Duration::try_from_secs_f64(seconds).ok());
+    duration.ok_or_else(|| "expected a number of seconds, 0 or more".to_owned())
 }
 
 impl Snapshot {
@@ -83,10 +101,19 @@ impl Snapshot {
 
 impl Train {
     pub fn run(self, root: &Root) -> Result<()> {
+        // Where it is too far away for the clock, there is none.
+        let deadline = self
+            .deadline
+            .and_then(|after| Instant::now().checked_add(after));
         let mut recipe = Recipe::load(&self.recipe)?;
         if !self.problems.is_empty() {
             recipe.problems.clone_from(&self.problems);
         }
+        if let Some(device) = self.device {
+            recipe.training.device = device;
+        }
+        // Before demonstrations are read.
+        recipe.training.device.check()?;
         if let Some(steps) = self.steps {
             recipe.training.steps = steps;
             recipe.snapshots = recipe.snapshots.min(steps);
@@ -98,13 +125,14 @@ impl Train {
                 .clone();
             recipe.start_from = Some(checkpoint);
         }
-        let average = recipe.average as usize;
+        let (average, steps) = (recipe.average as usize, recipe.training.steps);
         let shown = self.out.join("shown");
         let data = Data {
             demos: &self.demos,
             held_out: &self.held_out,
         };
-        let snapshots = train(root, recipe, data, &self.out, &shown, self.resume)?;
+        let out = &self.out;
+        let snapshots = train(root, recipe, data, out, &shown, self.resume, deadline)?;
         let best = snapshots.iter().max_by(|a, b| {
             a.rank()
                 .partial_cmp(&b.rank())
@@ -120,12 +148,20 @@ impl Train {
             std::fs::copy(&best.checkpoint, &policy)
                 .with_context(|| policy.display().to_string())?;
         }
+        let step = snapshots.last().map_or(0, |last| last.step);
+        let stopped = if step < steps { "deadline" } else { "end" };
         if self.json {
             println!(
                 "{}",
-                serde_json::json!({ "policy": policy, "best": best, "snapshots": snapshots })
+                serde_json::json!({
+                    "policy": policy, "best": best, "snapshots": snapshots,
+                    "stopped": stopped, "step": step, "steps": steps,
+                })
             );
         } else {
+            if step < steps {
+                println!("stopped by the deadline after step {step} of {steps}");
+            }
             let of = match average {
                 1 => format!("the snapshot of step {}", best.step),
                 count => format!("the mean of the last {count} snapshots"),
@@ -195,7 +231,7 @@ pub struct Data<'a> {
 }
 
 /// Trains by a recipe in a folder, or goes on with what the folder holds; gives all snapshots. The demonstrations that validation
-/// shows are kept in the folder `shown`.
+/// shows are kept in the folder `shown`. Stops after the step during which a deadline passes, with a snapshot of it.
 pub fn train(
     root: &Root,
     mut recipe: Recipe,
@@ -203,6 +239,7 @@ pub fn train(
     out: &Path,
     shown: &Path,
     resume: bool,
+    deadline: Option<Instant>,
 ) -> Result<Vec<Snapshot>> {
     root.check_trainable(&recipe.problems)?;
     let Data { demos, held_out } = data;
@@ -221,13 +258,22 @@ pub fn train(
     }
     let mut training = Training::open(recipe, data, out, resume)?;
     let log = out.join("snapshots.jsonl");
-    let mut snapshots = resume_log(&log, training.step())?;
+    let (mut snapshots, stopped) = resume_log(&log, training.step())?;
     let board = out.join("tensorboard");
     let written = || board.display().to_string();
     let mut events = EventFile::create(&board).with_context(written)?;
     let bar = progress::bar(training.recipe().training.steps, "steps");
     bar.set_position(training.step());
     let (mut pick, mut place, mut count) = (0.0, 0.0, 0u32);
+    if let Some(stopped) = stopped {
+        // Its means are of the first of the steps before the next snapshot.
+        let before = snapshots.last().map_or(0, |snapshot| snapshot.step);
+        count = (stopped.step - before) as u32;
+        (pick, place) = (
+            stopped.pick_loss * f64::from(count),
+            stopped.place_loss * f64::from(count),
+        );
+    }
     while !training.is_done() {
         let learning_rate = training.learning_rate();
         let losses = training.advance()?;
@@ -265,7 +311,9 @@ pub fn train(
                 HumanDuration(bar.eta())
             );
         }
-        if training.is_snapshot_due() {
+        let is_due = training.is_snapshot_due();
+        let is_late = deadline.is_some_and(|deadline| deadline <= Instant::now());
+        if is_due || is_late {
             let checkpoint = training.save_snapshot(&card(&training))?;
             let mut snapshot = Snapshot {
                 step: training.step(),
@@ -274,12 +322,13 @@ pub fn train(
                 place_loss: rounded(place / f64::from(count)),
                 completion: BTreeMap::new(),
                 reward: BTreeMap::new(),
+                at_deadline: !is_due,
             };
             (pick, place, count) = (0.0, 0.0, 0);
             bar.suspend(|| validate(root, training.recipe(), shown, &mut snapshot))?;
             if !held_out.is_empty() {
                 gctn::set_threads(1);
-                let policy = Policy::load(&snapshot.checkpoint)?;
+                let policy = decider(&snapshot.checkpoint, training.recipe())?;
                 let (distance, steps) = compare::held_out(policy, held_out)?;
                 tracing::info!(
                     "step {}: held out: {distance} from {steps} steps (median)",
@@ -298,6 +347,9 @@ pub fn train(
             snapshots.push(snapshot);
             // Last: a training that is killed before this goes on from the snapshot before, and validates this one again.
             training.save_state()?;
+        }
+        if is_late {
+            break;
         }
     }
     bar.finish_and_clear();
@@ -320,6 +372,12 @@ fn card(training: &Training) -> ModelCard {
     ])
 }
 
+/// A snapshot that decides where it was trained, in 32-bit floats.
+pub fn decider(checkpoint: &Path, recipe: &Recipe) -> Result<Policy> {
+    let device = recipe.training.device;
+    Ok(Policy::load_for(checkpoint, device, Precision::F32)?)
+}
+
 /// Lets a snapshot act on the validation episodes of every problem.
 fn validate(root: &Root, recipe: &Recipe, shown: &Path, snapshot: &mut Snapshot) -> Result<()> {
     if recipe.validation.episodes == 0 {
@@ -329,7 +387,7 @@ fn validate(root: &Root, recipe: &Recipe, shown: &Path, snapshot: &mut Snapshot)
     // One episode on one thread: `training.threads` of libtorch for each of as many episodes would be their square.
     gctn::set_threads(1);
     let mut actors: Vec<_> = (0..recipe.training.threads)
-        .map(|_| Ok(Actor::from(Policy::load(&snapshot.checkpoint)?)))
+        .map(|_| Ok(Actor::from(decider(&snapshot.checkpoint, recipe)?)))
         .collect::<Result<_>>()?;
     let start = match recipe.network.conditioning {
         GoalConditioning::Sequence => Start::Other,
@@ -366,23 +424,27 @@ fn rounded(value: f64) -> f64 {
     (1e6 * value).round() / 1e6
 }
 
-/// The snapshots of a training that goes on after `step`. Later ones are taken again: they are removed from the log, as is a line that
-/// was not written to its end.
-fn resume_log(path: &Path, step: u64) -> Result<Vec<Snapshot>> {
+/// The snapshots of a training that goes on after `step`, and the one that a deadline left there. Later ones are taken again: they are
+/// removed from the log, as are those of deadlines and a line that was not written to its end.
+fn resume_log(path: &Path, step: u64) -> Result<(Vec<Snapshot>, Option<Snapshot>)> {
     let what = || path.display().to_string();
     if !path.exists() {
-        return Ok(Vec::new());
+        return Ok((Vec::new(), None));
     }
     let text = std::fs::read_to_string(path).with_context(what)?;
     let whole = text.rsplit_once('\n').map_or("", |(whole, _)| whole);
     let snapshots = whole.lines().map(serde_json::from_str::<Snapshot>);
     let mut snapshots: Vec<_> = snapshots.collect::<Result<_, _>>().with_context(what)?;
-    snapshots.retain(|snapshot| snapshot.step <= step);
+    let stopped = snapshots
+        .iter()
+        .find(|snapshot| snapshot.at_deadline && snapshot.step == step)
+        .cloned();
+    snapshots.retain(|snapshot| snapshot.step <= step && !snapshot.at_deadline);
     std::fs::remove_file(path).with_context(what)?;
     for snapshot in &snapshots {
         append(path, snapshot)?;
     }
-    Ok(snapshots)
+    Ok((snapshots, stopped))
 }
 
 fn append(path: &Path, snapshot: &Snapshot) -> Result<()> {
@@ -404,7 +466,7 @@ mod tests {
     fn a_resumed_log_has_the_snapshots_before_the_state_alone() {
         let folder = tempfile::tempdir().unwrap();
         let log = folder.path().join("snapshots.jsonl");
-        for step in [2, 4] {
+        for step in [2, 4, 5] {
             let snapshot = Snapshot {
                 step,
                 checkpoint: PathBuf::new(),
@@ -412,21 +474,26 @@ mod tests {
                 place_loss: 0.2,
                 completion: BTreeMap::new(),
                 reward: BTreeMap::new(),
+                at_deadline: step == 5,
             };
             append(&log, &snapshot).unwrap();
         }
         let whole = std::fs::read_to_string(&log).unwrap();
-        // Killed after the line of step 4, before its state; and in the middle of a line.
+        // Stopped by a deadline at step 5. Killed after the line of step 4 or 5, before its state; and in the middle of a line.
         std::fs::write(&log, whole.clone() + "{\"step\": 6, \"che").unwrap();
-        let steps = |snapshots: Vec<Snapshot>| {
+        let steps = |(snapshots, stopped): (Vec<Snapshot>, Option<Snapshot>)| {
             let steps = snapshots.iter().map(|snapshot| snapshot.step);
-            steps.collect::<Vec<_>>()
+            (steps.collect::<Vec<_>>(), stopped.map(|one| one.step))
         };
-        assert_eq!(steps(resume_log(&log, 2).unwrap()), [2]);
+        let copy = folder.path().join("copy.jsonl");
+        std::fs::copy(&log, &copy).unwrap();
+        assert_eq!(steps(resume_log(&copy, 5).unwrap()), (vec![2, 4], Some(5)));
+        assert_eq!(steps(resume_log(&copy, 5).unwrap()), (vec![2, 4], None));
+        assert_eq!(steps(resume_log(&log, 2).unwrap()), (vec![2], None));
         let left = std::fs::read_to_string(&log).unwrap();
         assert_eq!(left.lines().next(), whole.lines().next());
         assert_eq!(left.lines().count(), 1);
-        assert_eq!(steps(resume_log(&log, 0).unwrap()), [0u64; 0]);
+        assert_eq!(steps(resume_log(&log, 0).unwrap()), (vec![], None));
         assert!(!log.exists());
     }
 }

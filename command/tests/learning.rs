@@ -106,6 +106,118 @@ fn a_full_disk_is_told_and_the_last_good_snapshot_stays_usable() {
 }
 
 #[test]
+fn a_deadline_stops_a_training_which_then_goes_on_as_if_it_had_not() {
+    let desk = Desk::new("deadline");
+    let train = |out: &str, more: &[&str]| {
+        let arguments = ["train", "--recipe", "recipe.yaml", "--json", "--out", out];
+        let output = desk.sctn(None, &[&arguments[..], more].concat());
+        assert!(output.status.success(), "{}", said(&output));
+        serde_json::from_slice::<serde_json::Value>(&output.stdout).unwrap()
+    };
+    // Snapshots after every step; then the recipe's two, of the same four steps.
+    let each = recipe("placing", 0).replace("snapshots: 2", "snapshots: 4");
+    std::fs::write(desk.path("recipe.yaml"), each).unwrap();
+    train("each", &[]);
+    std::fs::write(desk.path("recipe.yaml"), recipe("placing", 1)).unwrap();
+    let whole = train("whole", &[]);
+    assert_eq!(whole["stopped"], "end");
+    assert_eq!(whole["step"], 4);
+
+    // It has passed before the first step, which is done all the same.
+    for step in 1..4 {
+        let resume: &[&str] = if step > 1 { &["--resume"] } else { &[] };
+        let stopped = train("out", &[&["--deadline", "0"][..], resume].concat());
+        assert_eq!(stopped["stopped"], "deadline");
+        assert_eq!([&stopped["step"], &stopped["steps"]], [step, 4]);
+        let last = stopped["snapshots"].as_array().unwrap().last().unwrap();
+        assert_eq!(last["step"], step);
+        assert!(last["completion"]["placing"].is_number(), "{last}");
+        // Where the clock stopped it makes no difference to the weights.
+        let weights = |out: &str| {
+            let path = desk.path(&format!("{out}/snapshots/{step:07}.safetensors"));
+            let bytes = bytes(&path);
+            let head = u64::from_le_bytes(bytes[..8].try_into().unwrap()) as usize;
+            bytes[8 + head..].to_vec()
+        };
+        assert!(weights("out") == weights("each"), "step {step}");
+        assert!(desk.path("out/policy.safetensors").exists());
+    }
+    let resumed = train("out", &["--resume", "--deadline", "1e9"]);
+    let close = |one: &serde_json::Value, other: &serde_json::Value| {
+        (one.as_f64().unwrap() - other.as_f64().unwrap()).abs() < 1e-5
+    };
+    let [snapshots, expected] =
+        [&resumed, &whole].map(|report| report["snapshots"].as_array().unwrap());
+    assert_eq!(snapshots.len(), expected.len());
+    for (one, other) in snapshots.iter().zip(expected) {
+        assert_eq!(one["step"], other["step"]);
+        assert_eq!(one["completion"], other["completion"]);
+        for loss in ["pick_loss", "place_loss"] {
+            assert!(close(&one[loss], &other[loss]), "{loss}: {one} {other}");
+        }
+    }
+    let [whole, resumed] = ["whole", "out"].map(|out| desk.path(out).join("policy.safetensors"));
+    assert!(bytes(&whole) == bytes(&resumed), "another policy");
+
+    let wrong = ["train", "--recipe", "recipe.yaml", "--out", "wrong"];
+    let said = refused(&desk.sctn(None, &[&wrong[..], &["--deadline=-1"]].concat()));
+    assert!(said.contains("expected a number of seconds"), "{said}");
+}
+
+#[test]
+fn a_device_that_cannot_be_used_is_refused_before_anything_is_done() {
+    let desk = Desk::new("device");
+    std::fs::write(
+        desk.path("sweep.yaml"),
+        format!(
+            "{}agents: [sctn_step]\nseeds: [0]\ntest: {{episodes: 1, seed: 10000}}\n",
+            recipe("placing", 1).replace("demonstrations: 1", "demonstrations: [1]")
+        ),
+    )
+    .unwrap();
+    let commands = [
+        "train --recipe recipe.yaml --demos demos --out out",
+        "sweep --sweep sweep.yaml --demos demos --out out",
+        "evaluate --problem placing --seed 10000 --episodes 1",
+        "launch --problem placing --seed 10000 --record out",
+    ];
+    for command in commands {
+        let with = |device: &str| {
+            Command::new(env!("CARGO_BIN_EXE_sctn"))
+                .current_dir(desk.folder.path())
+                // Where this machine has CUDA, none of its cards is seen.
+                .env("CUDA_VISIBLE_DEVICES", "")
+                .args(["--root", ROOT])
+                .args(command.split(' '))
+                .args(["--device", device])
+                .output()
+                .unwrap()
+        };
+        for device in ["cuda", "cuda:1"] {
+            let said = refused(&with(device));
+            assert!(
+                said.contains(&format!("device {device} cannot be used: ")),
+                "{command}: {said}"
+            );
+        }
+        let said = refused(&with("gpu"));
+        assert!(
+            said.contains("device is gpu, expected cpu, cuda or cuda:N"),
+            "{command}: {said}"
+        );
+        assert!(!desk.path("out").exists(), "{command}");
+    }
+    // In a recipe too.
+    let asked = recipe("placing", 0).replace("threads: 1", "threads: 1, device: tpu");
+    std::fs::write(desk.path("recipe.yaml"), asked).unwrap();
+    let said = refused(&desk.train(None, "out", false));
+    assert!(
+        said.contains("recipe.yaml") && said.contains("device is tpu"),
+        "{said}"
+    );
+}
+
+#[test]
 fn demonstrations_of_another_problem_and_broken_ones_are_refused_by_name() {
     let desk = Desk::new("data");
     std::fs::rename(desk.path("demos/placing"), desk.path("demos/stacking")).unwrap();

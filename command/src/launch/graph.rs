@@ -3,6 +3,7 @@
 use super::operator::RequireApproval;
 use crate::root::Root;
 use anyhow::{Context as _, Result, bail};
+use gctn::Device;
 use node_kit::{Context, LifecycleClient, LifecycleError, Node, RosArguments, State, Transition};
 use std::path::{Path, PathBuf};
 use std::process::{ExitStatus, Stdio};
@@ -19,6 +20,8 @@ pub struct Settings {
     /// Without one, the oracle waits for one that is taught.
     pub demonstration: Option<PathBuf>,
     pub checkpoint: PathBuf,
+    /// Where the policy computes.
+    pub device: Device,
     /// What says which goal is next, as goal_oracle names it.
     pub goal_module: String,
     /// Checkpoint for the goal module of that name.
@@ -91,7 +94,10 @@ impl Settings {
                 ("checkpoint", path(&self.checkpoint)),
                 ("require_confirmation", self.operated.to_string()),
             ],
-            "gctn_policy" => vec![("checkpoint", path(&self.checkpoint))],
+            "gctn_policy" => vec![
+                ("checkpoint", path(&self.checkpoint)),
+                ("device", self.device.to_string()),
+            ],
             "operator_console" => match &self.console {
                 Some(console) => vec![
                     // Several graphs on one machine do not take each other's port.

@@ -9,6 +9,7 @@ use crate::root::Root;
 use anyhow::{Context as _, Result, bail};
 use bags::Demonstration;
 use clap::Args;
+use gctn::Device;
 use graph::{Graph, Settings};
 use heightmap::Heightmap;
 use msgs::convert::{self, heightmap_from_msg};
@@ -67,6 +68,9 @@ pub struct Launch {
     /// problem has no goals, the shipped one for any start]
     #[arg(long)]
     checkpoint: Option<PathBuf>,
+    /// Where the policy computes: cpu, cuda or cuda:N
+    #[arg(long, default_value_t)]
+    device: Device,
     /// Checkpoint for the goal module of that name [default: the shipped one]
     #[arg(long)]
     embedding: Option<PathBuf>,
@@ -103,6 +107,7 @@ struct Report {
 
 impl Launch {
     pub fn run(self, root: &Root) -> Result<()> {
+        self.device.check()?;
         let problem = root.problem(&self.problem)?;
         let work_cell = root.work_cell()?;
         let (max_steps, has_goals) = {
@@ -140,6 +145,7 @@ impl Launch {
                 }
             }),
             demonstration: shown,
+            device: self.device,
             goal_module: self.goal_module.clone(),
             embedding: self
                 .embedding

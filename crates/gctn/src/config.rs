@@ -557,15 +557,15 @@ pub enum Precision {
     Bf16,
 }
 
-/// Where to compute.
+/// Where to compute: as text `cpu`, `cuda` (the first card) or `cuda:N`.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
+#[serde(try_from = "String", into = "String")]
 pub enum Device {
     /// The processor.
     #[default]
     Cpu,
-    /// The first CUDA device.
-    Cuda,
+    /// A CUDA device, by its number.
+    Cuda(usize),
 }
 
 /// Random rigid motions, and colours, of a sample (Zeng et al., CoRL 2020).

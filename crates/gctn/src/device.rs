@@ -1,5 +1,8 @@
 //! Where libtorch computes.
 
+use std::fmt;
+use std::str::FromStr;
+
 use crate::{Device, Error, Precision};
 
 impl Device {
@@ -7,17 +10,75 @@ impl Device {
     pub(crate) fn open(self) -> Result<tch::Device, Error> {
         match self {
             Self::Cpu => Ok(tch::Device::Cpu),
-            Self::Cuda => {
-                let loaded = load_cuda();
-                if loaded.is_ok() && tch::Cuda::is_available() {
-                    return Ok(tch::Device::Cuda(0));
+            Self::Cuda(number) => {
+                let refused = |problem| Error::NoCuda {
+                    device: self,
+                    problem,
+                };
+                load_cuda().map_err(refused)?;
+                if !tch::Cuda::is_available() {
+                    return Err(refused("there is no card".into()));
                 }
-                let problem = loaded.err();
-                Err(Error::NoCuda {
-                    problem: problem.unwrap_or_else(|| "there is no card".into()),
-                })
+                let count = tch::Cuda::device_count();
+                if number as i64 >= count {
+                    return Err(refused(format!("there are {count} cards, counted from 0")));
+                }
+                // The sizes of a training are always the same: the fastest convolution for each is looked for once.
+                tch::Cuda::cudnn_set_benchmark(true);
+                Ok(tch::Device::Cuda(number))
             }
         }
+    }
+
+    /// Fails where it cannot be used, and says why.
+    pub fn check(self) -> Result<(), Error> {
+        self.open().map(drop)
+    }
+}
+
+impl fmt::Display for Device {
+    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::Cpu => formatter.write_str("cpu"),
+            Self::Cuda(0) => formatter.write_str("cuda"),
+            Self::Cuda(number) => write!(formatter, "cuda:{number}"),
+        }
+    }
+}
+
+impl FromStr for Device {
+    type Err = Error;
+
+    fn from_str(text: &str) -> Result<Self, Error> {
+        // A number as it is written by us: `cuda:+1` and `cuda:01` are typing errors.
+        let number = |text: &str| {
+            let number = text.parse::<u16>().ok()?;
+            (number.to_string() == text).then_some(usize::from(number))
+        };
+        let device = match text {
+            "cpu" => Some(Self::Cpu),
+            "cuda" => Some(Self::Cuda(0)),
+            _ => text.strip_prefix("cuda:").and_then(number).map(Self::Cuda),
+        };
+        device.ok_or_else(|| Error::Config {
+            what: "device",
+            actual: text.to_owned(),
+            expected: "cpu, cuda or cuda:N",
+        })
+    }
+}
+
+impl TryFrom<String> for Device {
+    type Error = Error;
+
+    fn try_from(text: String) -> Result<Self, Error> {
+        text.parse()
+    }
+}
+
+impl From<Device> for String {
+    fn from(device: Device) -> Self {
+        device.to_string()
     }
 }
 
@@ -32,8 +93,8 @@ impl Precision {
     }
 }
 
-impl std::fmt::Display for Precision {
-    fn fmt(&self, formatter: &mut std::fmt::Formatter<'_>) -> std::fmt::Result {
+impl fmt::Display for Precision {
+    fn fmt(&self, formatter: &mut fmt::Formatter<'_>) -> fmt::Result {
         formatter.write_str(match self {
             Self::F32 => "f32",
             Self::Bf16 => "bf16",
@@ -90,19 +151,50 @@ mod tests {
         let has = info.split_whitespace().any(|flag| flag == "avx512_bf16");
         let expected = if has { Precision::Bf16 } else { Precision::F32 };
         assert_eq!(Precision::Bf16.on(Device::Cpu), expected);
-        assert_eq!(Precision::Bf16.on(Device::Cuda), Precision::Bf16);
+        assert_eq!(Precision::Bf16.on(Device::Cuda(0)), Precision::Bf16);
         assert_eq!(Precision::F32.on(Device::Cpu), Precision::F32);
     }
 
     #[test]
-    fn without_cuda_the_error_says_what_was_looked_for() {
-        match Device::Cuda.open() {
-            Ok(device) => assert_eq!(device, tch::Device::Cuda(0)),
-            Err(error) => {
-                let error = error.to_string();
-                let told = error.contains("libtorch_cuda.so") || error.contains("no card");
-                assert!(told, "{error}");
+    fn without_cuda_the_error_says_what_was_asked_for_and_looked_for() {
+        for (number, name) in [(0, "cuda"), (9, "cuda:9")] {
+            match Device::Cuda(number).open() {
+                Ok(device) => assert_eq!(device, tch::Device::Cuda(number)),
+                Err(error) => {
+                    let error = error.to_string();
+                    assert!(error.starts_with(&format!("device {name} ")), "{error}");
+                    let reasons = ["libtorch_cuda.so", "no card", "cards, counted from 0"];
+                    assert!(
+                        reasons.iter().any(|reason| error.contains(reason)),
+                        "{error}"
+                    );
+                }
             }
+        }
+    }
+
+    #[test]
+    fn a_device_is_written_as_it_is_read_and_others_are_refused_by_name() {
+        for (text, device) in [
+            ("cpu", Device::Cpu),
+            ("cuda", Device::Cuda(0)),
+            ("cuda:3", Device::Cuda(3)),
+        ] {
+            assert_eq!(text.parse::<Device>().unwrap(), device);
+            assert_eq!(device.to_string(), text);
+            let json = serde_json::to_string(&device).unwrap();
+            assert_eq!(json, format!("\"{text}\""));
+            assert_eq!(serde_json::from_str::<Device>(&json).unwrap(), device);
+        }
+        assert_eq!("cuda:0".parse::<Device>().unwrap(), Device::Cuda(0));
+        for wrong in [
+            "", "gpu", "CUDA", "cuda:", "cuda:-1", "cuda:01", "cuda:x", "cuda1",
+        ] {
+            let error = wrong.parse::<Device>().unwrap_err().to_string();
+            assert_eq!(
+                error,
+                format!("device is {wrong}, expected cpu, cuda or cuda:N")
+            );
         }
     }
 }

@@ -134,8 +134,10 @@ pub enum Error {
         source: std::io::Error,
     },
     /// The device cannot be used.
-    #[error("no CUDA device can be used: {problem}")]
+    #[error("device {device} cannot be used: {problem}")]
     NoCuda {
+        /// Which.
+        device: crate::Device,
         /// Why.
         problem: String,
     },

@@ -14,7 +14,7 @@ use std::{
 };
 
 use anyhow::{Context as _, bail};
-use gctn::{Decision, GoalConditioning, Policy};
+use gctn::{Decision, Device, GoalConditioning, Policy, Precision};
 use heightmap::ChangeRules;
 use msgs::{
     convert,
@@ -60,12 +60,13 @@ pub async fn configure(node: Node, parameters: GctnPolicyParameters) -> anyhow::
         markers: node.publisher("pick_place/markers", Qos::Latched)?,
         scores: node.publisher("pick_place/scores", Qos::Latched)?,
     };
-    let threads = parameters.threads;
+    let (threads, device) = (parameters.threads, parameters.device);
+    device.check().context("parameter device")?;
     let reading = path.clone();
     let policy = node
         .spawn_blocking(move || {
             gctn::set_threads(threads);
-            load(&reading)
+            load(&reading, device)
         })
         .await
         .context("loading the checkpoint")?
@@ -77,14 +78,15 @@ pub async fn configure(node: Node, parameters: GctnPolicyParameters) -> anyhow::
             checkpoint: path.clone(),
         })),
         checkpoint: path,
+        device,
         loads: ReplyCache::default(),
         outputs,
     })
 }
 
 /// A policy that can follow the goals of the graph.
-fn load(path: &Path) -> anyhow::Result<Policy> {
-    let policy = Policy::load(path)?;
+fn load(path: &Path, device: Device) -> anyhow::Result<Policy> {
+    let policy = Policy::load_for(path, device, Precision::F32)?;
     let conditioning = policy.config().conditioning;
     if !matches!(
         conditioning,
@@ -104,6 +106,7 @@ pub struct PolicyNode {
     policy: Arc<Mutex<LoadedPolicy>>,
     /// The checkpoint in use.
     checkpoint: PathBuf,
+    device: Device,
     /// Answers to calls of `load_checkpoint`.
     loads: ReplyCache<LoadCheckpointResponse>,
     outputs: Outputs,
@@ -208,8 +211,9 @@ impl Active for PolicyNode {
                         None => {
                             let policy = Arc::clone(&self.policy);
                             let sender = loaded_sender.clone();
+                            let device = self.device;
                             node.spawn_blocking(move || {
-                                let read = load(Path::new(&request.path));
+                                let read = load(Path::new(&request.path), device);
                                 // What is being decided is decided first.
                                 let read = read.map(|read| {
                                     let mut policy = policy.lock().unwrap_or_else(PoisonError::into_inner);

@@ -2,6 +2,7 @@
 
 use std::path::{Path, PathBuf};
 
+use gctn::Device;
 use node_kit::{InvalidParameter, Parameters, Range};
 use serde::{Deserialize, Serialize};
 
@@ -12,6 +13,7 @@ use serde::{Deserialize, Serialize};
 pub struct GctnPolicyParameters {
     pub checkpoint: PathBuf,
     pub threads: usize,
+    pub device: Device,
     pub exclusion_radius_m: f64,
     pub observation_tolerance_m: f64,
     pub observation_changed_area_mm2: f64,
@@ -24,6 +26,7 @@ impl Default for GctnPolicyParameters {
         Self {
             checkpoint: PathBuf::new(),
             threads: 1,
+            device: Device::Cpu,
             exclusion_radius_m: 0.02,
             observation_tolerance_m: 0.005,
             observation_changed_area_mm2: 75.0,

@@ -230,6 +230,40 @@ async fn without_a_checkpoint_the_node_refuses_to_start() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
+async fn a_device_that_cannot_be_used_keeps_the_node_from_starting() {
+    let directory = tempfile::tempdir().unwrap();
+    let checkpoint = untrained(&directory).display().to_string();
+    for (device, expected) in [
+        ("gpu", "device is gpu, expected cpu, cuda or cuda:N"),
+        ("cuda:99", "device cuda:99 cannot be used"),
+    ] {
+        let argument = |name: &str, value: &str| ParameterSource::Argument {
+            node: None,
+            name: name.into(),
+            value: value.into(),
+        };
+        let arguments = RosArguments {
+            parameters: vec![
+                argument("checkpoint", &checkpoint),
+                argument("device", device),
+            ],
+            ..RosArguments::default()
+        };
+        let context = Context::new(DdsNetwork::unused().unwrap());
+        let policy = context.start(
+            "gctn_policy",
+            &arguments,
+            |node, parameters: GctnPolicyParameters| gctn_policy::configure(node, parameters),
+        );
+        let error = match policy {
+            Ok(policy) => format!("{:#}", policy.await.unwrap().unwrap_err()),
+            Err(error) => format!("{error:#}"),
+        };
+        assert!(error.contains(expected), "{error}");
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
 async fn a_heightmap_that_may_show_the_arm_makes_no_proposal() {
     let directory = tempfile::tempdir().unwrap();
     let checkpoint = untrained(&directory);

@@ -7,11 +7,10 @@ fn main() {
     if let Ok(libraries) = std::env::var("DEP_TCH_LIBTORCH_LIB") {
         println!("cargo::rustc-link-arg=-Wl,-rpath,{libraries}");
     }
-    // A tree that was moved after the build: target/release and target/release/deps.
-    for origin in [
-        "$ORIGIN/../../.libtorch/lib",
-        "$ORIGIN/../../../.libtorch/lib",
-    ] {
-        println!("cargo::rustc-link-arg=-Wl,-rpath,{origin}");
+    // A tree that was moved after the build: target/release and target/release/deps. What computes on CUDA is looked for at run time.
+    for folder in [".libtorch", ".libtorch-cuda"] {
+        for up in ["../..", "../../.."] {
+            println!("cargo::rustc-link-arg=-Wl,-rpath,$ORIGIN/{up}/{folder}/lib");
+        }
     }
 }

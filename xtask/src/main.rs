@@ -32,6 +32,9 @@ enum Task {
         /// Also make what the end-to-end tests need: .venv with rclpy and our messages
         #[arg(long)]
         python: bool,
+        /// Also make what computes on an NVIDIA card: .libtorch-cuda, which programs find at run time
+        #[arg(long)]
+        cuda: bool,
     },
     /// After an edit: formatting, clippy and unit tests of the packages that have changed
     Check {
@@ -65,8 +68,12 @@ enum Task {
 
 fn main() -> Result<()> {
     match Arguments::parse().task {
-        Task::Setup { python } => {
-            libtorch::set_up(&python::with_pip()?)?;
+        Task::Setup { python, cuda } => {
+            let pip = python::with_pip()?;
+            libtorch::set_up(&pip)?;
+            if cuda {
+                libtorch::set_up_cuda(&pip)?;
+            }
             if python {
                 python::Environment::set_up()?;
             }

@@ -2,7 +2,7 @@
 
 use rand_chacha::ChaCha8Rng;
 use std::path::Path;
-use tch::Tensor;
+use tch::{Kind, Tensor};
 
 use crate::batch::{Batch, BatchMaker};
 use crate::candidates::{candidate_loss, turn_shapes};
@@ -37,6 +37,24 @@ pub struct Losses {
     pub gradient_norm: f64,
 }
 
+impl Losses {
+    /// From where they were computed, at once: each reading waits for all that is being computed there.
+    fn read([pick, place, done, gradient_norm]: [&Tensor; 4]) -> Result<Self, Error> {
+        let all = [pick, place, done, gradient_norm].map(Tensor::detach);
+        let all = Tensor::f_stack(&all, 0)?.to_kind(Kind::Double);
+        let mut numbers = [0.0; 4];
+        all.to_device(tch::Device::Cpu)
+            .f_copy_data(&mut numbers, 4)?;
+        let [pick, place, done, gradient_norm] = numbers;
+        Ok(Self {
+            pick,
+            place,
+            done,
+            gradient_norm,
+        })
+    }
+}
+
 const FORMAT: &str = "gctn-training";
 const VERSION: &str = "1";
 
@@ -47,12 +65,12 @@ impl Trainer {
         training.check()?;
         crate::set_threads(training.threads);
         let device = training.device.open()?;
-        let model = Model::new(
+        let mut model = Model::new(
             network,
             Builder::random(training.seed, device),
             training.precision.on(training.device),
         );
-        let weights = model.parameters.require_gradients();
+        let weights = model.learn();
         let optimiser = AdamW::new(&model.parameters.flat);
         Ok(Self {
             config: training.clone(),
@@ -135,17 +153,8 @@ impl Trainer {
         let [pick, place, done] = self.forward(batch)?;
         let sum = &pick + &place + &done;
         let gradients = Tensor::f_run_backward(&[sum], &self.weights, false, false)?;
-        let flat: Vec<Tensor> = gradients
-            .iter()
-            .map(|gradient| gradient.reshape([-1]))
-            .collect();
-        let gradient = Tensor::cat(&flat, 0);
-        let losses = Losses {
-            pick: pick.double_value(&[]),
-            place: place.double_value(&[]),
-            done: done.double_value(&[]),
-            gradient_norm: gradient.norm().double_value(&[]),
-        };
+        let gradient = self.model.parameters.flat_gradient(&gradients);
+        let losses = Losses::read([&pick, &place, &done, &gradient.norm()])?;
         for (what, value) in [
             ("the pick loss", losses.pick),
             ("the place loss", losses.place),
@@ -173,12 +182,7 @@ impl Trainer {
     pub fn losses(&self, samples: &[Sample<'_>]) -> Result<Losses, Error> {
         let batch = self.batch_maker().unaugmented(samples)?;
         let [pick, place, done] = tch::no_grad(|| self.forward(batch))?;
-        Ok(Losses {
-            pick: pick.double_value(&[]),
-            place: place.double_value(&[]),
-            done: done.double_value(&[]),
-            gradient_norm: 0.0,
-        })
+        Losses::read([&pick, &place, &done, &done.zeros_like()])
     }
 
     fn forward(&self, batch: Batch) -> Result<[Tensor; 3], Error> {
@@ -190,6 +194,7 @@ impl Trainer {
             mut rng,
             ..
         } = batch;
+        self.model.parameters.cast();
         let features = self.model.forward(&input.to_device(self.device));
         let (grid, sigma) = (&self.model.grid, self.config.label_sigma_cells);
         let to_do = |index: &usize| !labels[*index].done;

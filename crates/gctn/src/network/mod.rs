@@ -212,6 +212,13 @@ impl Model {
         self.parameters.prepare(self.kind());
     }
 
+    /// From now on gradients reach the weights: gives what they are to be taken along. [`Parameters::cast`] comes before each
+    /// forward pass after the weights have changed.
+    pub fn learn(&mut self) -> Vec<Tensor> {
+        let kind = self.kind();
+        self.parameters.learn(kind)
+    }
+
     /// Kind of numbers that the convolutions compute in.
     fn kind(&self) -> Kind {
         match self.precision {

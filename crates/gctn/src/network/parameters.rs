@@ -21,6 +21,8 @@ pub(crate) struct Builder {
     device: Device,
     kind: Kind,
     entries: Vec<(String, Tensor)>,
+    /// Of each entry, whether it belongs to a convolution.
+    of_convolutions: Vec<bool>,
 }
 
 impl Builder {
@@ -31,6 +33,7 @@ impl Builder {
             device,
             kind: Kind::Float,
             entries: Vec::new(),
+            of_convolutions: Vec::new(),
         }
     }
 
@@ -51,8 +54,9 @@ impl Builder {
         }
     }
 
-    fn add(&mut self, name: String, tensor: Tensor) -> Tensor {
+    fn add(&mut self, name: String, tensor: Tensor, of_convolution: bool) -> Tensor {
         let tensor = tensor.to_kind(self.kind);
+        self.of_convolutions.push(of_convolution);
         self.entries.push((name, tensor.shallow_clone()));
         tensor
     }
@@ -72,7 +76,7 @@ impl Builder {
     /// A single number.
     pub fn scalar(&mut self, name: &str, value: f64) -> Tensor {
         let tensor = Tensor::full([1], value, (Kind::Float, Device::Cpu));
-        self.add(name.into(), tensor)
+        self.add(name.into(), tensor, false)
     }
 
     /// A convolution with bias, padded so that at stride 1 the size stays.
@@ -95,8 +99,8 @@ impl Builder {
         let weight = self.uniform(&[outputs, inputs, size, size], weight_bound);
         let bias = self.uniform(&[outputs], bias_bound);
         Conv {
-            weight: self.add(format!("{name}.weight"), weight),
-            bias: self.add(format!("{name}.bias"), bias),
+            weight: self.add(format!("{name}.weight"), weight, true),
+            bias: self.add(format!("{name}.bias"), bias, true),
             stride: stride as i64,
             // A 4x4 kernel of stride 2 is padded by 1, a 3x3 one too, a 1x1 one by 0.
             padding: (size - 1) / 2,
@@ -119,7 +123,12 @@ impl Builder {
             tensor.set_data(&view);
             offset += len;
         }
-        Parameters { entries, flat }
+        Parameters {
+            entries,
+            of_convolutions: self.of_convolutions,
+            flat,
+            cast: None,
+        }
     }
 }
 
@@ -128,8 +137,11 @@ impl Builder {
 pub(crate) struct Parameters {
     /// In a fixed order.
     pub entries: Vec<(String, Tensor)>,
+    of_convolutions: Vec<bool>,
     /// All of them, one after the other.
     pub flat: Tensor,
+    /// The same in another kind, of which the weights of convolutions are views in a training that computes in it.
+    cast: Option<Tensor>,
 }
 
 impl Parameters {
@@ -145,6 +157,54 @@ impl Parameters {
         for kernel in tensors.filter(|tensor| tensor.dim() == 4) {
             let prepared = channels_last(&kernel.to_kind(kind));
             kernel.shallow_clone().set_data(&prepared);
+        }
+    }
+
+    /// From now on gradients reach the weights, those of convolutions in this kind: gives what they are to be taken along, one for each
+    /// entry. Of another kind than the flat tensor's, convolutions use a copy of it, which is of now until [`Parameters::cast`].
+    pub fn learn(&mut self, kind: Kind) -> Vec<Tensor> {
+        if kind == self.flat.kind() {
+            return self.require_gradients();
+        }
+        let cast = self.flat.to_kind(kind);
+        let mut offset = 0;
+        let used = self.entries.iter_mut().zip(&self.of_convolutions);
+        let used = used.map(|((_, entry), of_convolution)| {
+            let (len, size) = (entry.numel() as i64, entry.size());
+            let view = |flat: &Tensor| flat.narrow(0, offset, len).view(size.as_slice());
+            let mut used = entry.shallow_clone();
+            if *of_convolution {
+                // The entry stays a view of the flat tensor, and what the convolution holds becomes one of the copy.
+                *entry = view(&self.flat);
+                used.set_data(&view(&cast));
+            }
+            offset += len;
+            used.set_requires_grad(true)
+        });
+        let used = used.collect();
+        self.cast = Some(cast);
+        used
+    }
+
+    /// Gives convolutions the weights as they are now, where they use a copy.
+    pub fn cast(&self) {
+        if let Some(cast) = &self.cast {
+            tch::no_grad(|| cast.shallow_clone().copy_(&self.flat));
+        }
+    }
+
+    /// Gradients along what [`Parameters::learn`] gave, as the flat tensor has the weights.
+    pub fn flat_gradient(&self, gradients: &[Tensor]) -> Tensor {
+        let flat = gradients.iter().map(|gradient| gradient.reshape([-1]));
+        let flat: Vec<Tensor> = flat.collect();
+        // Those of one kind at once, and not each for itself.
+        let runs = flat.chunk_by(|one, next| one.kind() == next.kind());
+        let runs: Vec<Tensor> = runs
+            .map(|run| Tensor::cat(run, 0).to_kind(self.flat.kind()))
+            .collect();
+        match &*runs {
+            [only] => only.shallow_clone(),
+            runs => Tensor::cat(runs, 0),
         }
     }
 

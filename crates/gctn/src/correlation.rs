@@ -1,5 +1,8 @@
 //! Rotated query windows, and their correlation with key features.
 
+use std::cell::RefCell;
+use std::thread::LocalKey;
+
 use nalgebra::{Point2, Rotation2, Vector2};
 use tch::{Device, Kind, Tensor};
 
@@ -44,46 +47,64 @@ pub(crate) fn sampled_windows(
     let size = features.size();
     let [samples, channels, rows, cols] = [size[0], size[1], size[2], size[3]];
     let turn_count = turns[0].len();
-    // Feature index -> [-1, 1] with -1 and 1 at the centres of the outermost cells.
-    let normal = Vector2::new(2.0 / (cols - 1) as f64, 2.0 / (rows - 1) as f64);
-    // From the centre to each cell of each window.
-    let offsets = |turns: &[usize]| -> Vec<Vector2<f64>> {
+    // From the centre to each cell of each window, rows of x and y.
+    let offsets = |turns: &[usize]| {
         let cell = |index: usize| Vector2::new((index % window) as f64, (index / window) as f64);
         let turned = |turn: &usize| {
             let inverse = Rotation2::new(-rotation_angle(*turn, rotations));
-            (0..window * window).map(move |index| inverse * cell(index).add_scalar(-middle))
+            (0..window * window).flat_map(move |index| {
+                let offset = inverse * cell(index).add_scalar(-middle);
+                [offset.x, offset.y]
+            })
         };
-        turns.iter().flat_map(turned).collect()
+        let offsets: Vec<f64> = turns.iter().flat_map(turned).collect();
+        Tensor::from_slice(&offsets).view([1, -1, 2])
     };
+    let device = features.device();
     let are_turned_alike = turns.iter().all(|other| *other == turns[0]);
-    let shared = are_turned_alike.then(|| offsets(&turns[0]));
+    let offsets = match are_turned_alike {
+        true => {
+            let key = (
+                window,
+                middle.to_bits(),
+                rotations,
+                turns[0].clone(),
+                device,
+            );
+            kept(&OFFSETS, key, || offsets(&turns[0]).to_device(device))
+        }
+        false => {
+            let each: Vec<Tensor> = turns.iter().map(|turns| offsets(turns)).collect();
+            Tensor::cat(&each, 0).to_device(device)
+        }
+    };
     // Where all windows of all samples lie alike, they are computed once.
     let are_alike = are_turned_alike && centers.iter().all(|other| *other == centers[0]);
     let chosen = match are_alike {
         true => &centers[..1],
         false => centers,
     };
-    let mut points: Vec<f64> = Vec::with_capacity(2 * chosen.len() * turn_count * window * window);
-    for (center, turns) in chosen.iter().zip(turns) {
-        let own = match &shared {
-            Some(_) => Vec::new(),
-            None => offsets(turns),
-        };
-        for offset in shared.as_ref().unwrap_or(&own) {
-            let point = center.coords + offset;
-            let point = match sampling {
-                Interpolation::Bilinear => point,
-                Interpolation::Nearest => point.map(nearest),
-            };
-            points.extend((point.component_mul(&normal)).add_scalar(-1.0).iter());
-        }
-    }
+    // Feature index -> [-1, 1] with -1 and 1 at the centres of the outermost cells; in 64 bits, whatever the features are in.
+    let normal = [2.0 / (cols - 1) as f64, 2.0 / (rows - 1) as f64];
+    let places: Vec<f64> = chosen
+        .iter()
+        .flat_map(|center| [center.x, center.y])
+        .collect();
+    let [normal, places] = [&normal[..], &places[..]].map(|numbers| {
+        let numbers = Tensor::from_slice(numbers).view([-1, 1, 2]);
+        numbers.to_device(device)
+    });
+    let points = places + offsets;
+    let points = match sampling {
+        Interpolation::Bilinear => points,
+        Interpolation::Nearest => nearest(&points),
+    };
+    let points = points * normal - 1.0;
     let (turn_count, window) = (turn_count as i64, window as i64);
     let count = centers.len() as i64;
-    let points = Tensor::from_slice(&points)
-        .view([chosen.len() as i64, turn_count * window, window, 2])
+    let points = points
         .to_kind(features.kind())
-        .to_device(features.device())
+        .view([chosen.len() as i64, turn_count * window, window, 2])
         .expand([count, -1, -1, -1], false)
         .reshape([samples, -1, window, 2]);
     let mode = match sampling {
@@ -99,11 +120,41 @@ pub(crate) fn sampled_windows(
         .reshape([count, turn_count, channels, window, window])
 }
 
-/// The nearest whole number, the even one of two that are equally near. Turns of 60 and 90 degrees meet
+/// The nearest whole numbers, the even one of two that are equally near. Turns of 60 and 90 degrees meet
 /// such ties; sine and cosine miss them by a last bit, one way or the other.
-fn nearest(index: f64) -> f64 {
+fn nearest(indices: &Tensor) -> Tensor {
     const TIE: f64 = 1e9;
-    ((index * TIE).round() / TIE).round_ties_even()
+    // Ties go to the even number.
+    ((indices * TIE).round() / TIE).round()
+}
+
+/// Tables by what they depend on. Each thread has its own, on the devices that it computes on.
+type Tables<K> = LocalKey<RefCell<Vec<(K, Tensor)>>>;
+
+/// Window, middle (bits), rotations, turns.
+type OffsetsKey = (usize, u64, usize, Vec<usize>, Device);
+/// Length of the circle, numbers, which matrix.
+type SpectrumKey = (i64, i64, Matrix, (Kind, Device));
+
+thread_local! {
+    static OFFSETS: RefCell<Vec<(OffsetsKey, Tensor)>> = const { RefCell::new(Vec::new()) };
+    static SPECTRA: RefCell<Vec<(SpectrumKey, Tensor)>> = const { RefCell::new(Vec::new()) };
+}
+
+/// The table of this key, made where it is not there. A network needs few.
+fn kept<K: PartialEq>(tables: &'static Tables<K>, key: K, make: impl FnOnce() -> Tensor) -> Tensor {
+    const MOST: usize = 32;
+    tables.with_borrow_mut(|tables| {
+        if let Some((_, table)) = tables.iter().find(|(known, _)| *known == key) {
+            return table.shallow_clone();
+        }
+        if tables.len() == MOST {
+            drop(tables.remove(0));
+        }
+        let table = make();
+        tables.push((key, table.shallow_clone()));
+        table
+    })
 }
 
 /// Correlates key features (N x C x H x W, margin included) with windows (N x R x C x k x k).
@@ -167,6 +218,14 @@ fn correlate_in_column_frequencies(key: &Tensor, windows: &Tensor, grid: &Grid) 
         .view([samples, turns, rows, cols])
 }
 
+/// Which matrix of a transform.
+#[derive(Clone, Copy, PartialEq)]
+enum Matrix {
+    Forth,
+    OfConjugates,
+    Back,
+}
+
 /// The discrete Fourier transform of real numbers as matrices.
 struct Spectrum {
     /// Numbers, the circle on which a correlation wraps.
@@ -187,6 +246,16 @@ impl Spectrum {
     /// A matrix of so many rows for each frequency x numbers, of the first numbers. Each row is a factor times the frequency's cosine
     /// and another times its sine.
     fn matrix<const ROWS: usize>(
+        &self,
+        which: Matrix,
+        numbers: i64,
+        factors: impl Fn(i64) -> [[f64; 2]; ROWS],
+    ) -> Tensor {
+        let key = (self.len, numbers, which, self.options);
+        kept(&SPECTRA, key, || self.make(numbers, factors))
+    }
+
+    fn make<const ROWS: usize>(
         &self,
         numbers: i64,
         factors: impl Fn(i64) -> [[f64; 2]; ROWS],
@@ -213,7 +282,9 @@ impl Spectrum {
 
     /// Real and imaginary parts of the spectra of N x rows x numbers, padded with 0: N x 2 * frequencies x rows.
     fn of(&self, numbers: &Tensor) -> Tensor {
-        let matrix = self.matrix(numbers.size()[2], |_| [[1.0, 0.0], [0.0, -1.0]]);
+        let matrix = self.matrix(Matrix::Forth, numbers.size()[2], |_| {
+            [[1.0, 0.0], [0.0, -1.0]]
+        });
         matrix.matmul(&numbers.transpose(1, 2))
     }
 
@@ -222,7 +293,7 @@ impl Spectrum {
     fn of_conjugates(&self, numbers: &Tensor) -> Tensor {
         let real = [1.0, 0.0];
         let rows = |_| [real, [0.0, 1.0], [0.0, -1.0], real];
-        let matrix = self.matrix(numbers.size()[2], rows);
+        let matrix = self.matrix(Matrix::OfConjugates, numbers.size()[2], rows);
         matrix.matmul(&numbers.transpose(1, 2))
     }
 
@@ -234,7 +305,7 @@ impl Spectrum {
             let share = if alone { 1.0 } else { 2.0 } / self.len as f64;
             [[share, 0.0], [0.0, -share]]
         };
-        let matrix = self.matrix(numbers, factors);
+        let matrix = self.matrix(Matrix::Back, numbers, factors);
         spectra.transpose(1, 2).matmul(&matrix)
     }
 }

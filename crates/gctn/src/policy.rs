@@ -228,20 +228,37 @@ impl Policy {
 
     fn place(&self, logits: &Tensor) -> Result<(Point2<f64>, usize, f64, ScoreMap), Error> {
         let grid = &self.model.grid;
-        // What lies further below the top adds nothing to the sum.
-        const DEEPEST: f32 = 40.0;
-        let logits = values(logits, "the place map")?;
-        let best = argmax(&logits);
-        let top = logits[best];
-        let near = logits.iter().filter(|logit| top - **logit < DEEPEST);
-        let sum: f64 = near.map(|logit| f64::from(logit - top).exp()).sum();
-        let log_sum = f64::from(top) + sum.ln();
         let cells = grid.rows * grid.cols;
-        let (rotation, cell) = (best / cells, best % cells);
-        let map = &logits[rotation * cells..][..cells];
+        // Found where the maps were computed: of all turns only one map is copied, and there is one wait for it.
+        let logits = logits.reshape([-1, cells as i64]);
+        let best = logits.argmax(None, false);
+        let rotation = best.divide_scalar_mode(cells as i64, "floor");
+        let (low, top) = (logits.min(), logits.max());
+        let sum = (&logits - &top)
+            .to_kind(Kind::Double)
+            .exp()
+            .sum(Kind::Double);
+        let found = [best, low, top, sum].map(|number| number.to_kind(Kind::Double).view([1]));
+        let map = logits.index_select(0, &rotation.view([1])).view([-1]);
+        let [best, low, top, sum] = &found;
+        let read = Tensor::cat(&[best, low, top, sum, &map.to_kind(Kind::Double)], 0);
+        let mut numbers = vec![0.0f64; read.numel()];
+        read.to_device(tch::Device::Cpu)
+            .f_copy_data(&mut numbers, read.numel())?;
+        let ([best, low, top, sum], map) = match numbers.split_first_chunk() {
+            Some((found, map)) => (*found, map),
+            None => ([f64::NAN; 4], &[][..]),
+        };
+        if !(low.is_finite() && top.is_finite() && sum.is_finite()) {
+            let what = "the place map";
+            return Err(Error::NotFinite { what, step: None });
+        }
+        let map: Vec<f32> = map.iter().map(|logit| *logit as f32).collect();
+        let log_sum = top + sum.ln();
+        let (rotation, cell) = (best as usize / cells, best as usize % cells);
         let (row, col) = (cell / grid.cols, cell % grid.cols);
         let offset = if grid.subcell {
-            subcell(map, grid.rows, grid.cols, row, col)
+            subcell(&map, grid.rows, grid.cols, row, col)
         } else {
             [0.0; 2]
         };

@@ -1,6 +1,7 @@
 //! `sctn bench`: the inner loops, timed by criterion, and what demonstrations cost.
 
 use crate::demos::demonstration;
+use crate::device_bench::DeviceArguments;
 use crate::latency::Chain;
 use crate::root::Root;
 use anyhow::{Context, Result, bail};
@@ -23,14 +24,17 @@ use std::time::Duration;
 #[derive(Args)]
 pub struct Bench {
     /// Only benchmarks whose name contains this; those of problems are called demonstration_PROBLEM. `idle`: what the graph
-    /// costs while it waits for an operator. `camera_stream`: three cameras at 30 Hz into camera_fusion
+    /// costs while it waits for an operator. `camera_stream`: three cameras at 30 Hz into camera_fusion. `device_parity`: the
+    /// same gradient steps on the processor and on a device. `device_speed`: gradient steps per second there
     name: Option<String>,
     /// Demonstrations of each problem
     #[arg(long, default_value_t = 10)]
     demonstrations: u64,
-    /// Seconds of `camera_stream`
+    /// Seconds of `camera_stream`, and about those of `device_speed`
     #[arg(long, default_value_t = 60.0)]
     seconds: f64,
+    #[command(flatten)]
+    on_device: DeviceArguments,
     /// Print a JSON object last
     #[arg(long)]
     json: bool,
@@ -174,6 +178,13 @@ impl Bench {
         if self.name.as_deref() == Some("camera_stream") {
             return self.camera_stream(root);
         }
+        match self.name.as_deref() {
+            Some("device_parity") => return self.printed(&self.on_device.parity(root)?),
+            Some("device_speed") => {
+                return self.printed(&self.on_device.speed(root, self.seconds)?);
+            }
+            _ => {}
+        }
         let wanted = |name: &str| self.name.as_ref().is_none_or(|part| name.contains(part));
         let chosen: Vec<_> = WORKLOADS.iter().filter(|w| wanted(w.name)).collect();
         let problems = root.join("config/problems");
@@ -302,6 +313,16 @@ impl Report {
 }
 
 impl Bench {
+    /// On one line as JSON, or on many for a person.
+    fn printed(&self, report: &impl Serialize) -> Result<()> {
+        let text = match self.json {
+            true => serde_json::to_string(report)?,
+            false => serde_json::to_string_pretty(report)?,
+        };
+        println!("{text}");
+        Ok(())
+    }
+
     /// Fails where an image was lost.
     fn camera_stream(&self, root: &Root) -> Result<()> {
         if !(self.seconds.is_finite() && self.seconds > 0.0) {

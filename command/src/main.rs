@@ -11,6 +11,7 @@ mod console;
 mod curves;
 mod decide;
 mod demos;
+mod device_bench;
 mod embed;
 mod evaluate;
 mod gallery;

@@ -6,6 +6,7 @@ mod command;
 mod demo;
 #[cfg(test)]
 mod documents;
+mod gpu;
 mod layers;
 mod libtorch;
 mod licences;
@@ -62,6 +63,8 @@ enum Task {
     },
     /// Inject faults at random moments of motions, while an independent monitor reads the joints and the approvals
     Campaign(campaign::Options),
+    /// On a host with a GPU: parity with the processor, steps per second, trainings with a deadline; one JSON file comes back
+    Gpu(gpu::Options),
     /// Check that every dependency has a permissive licence
     Licences,
 }
@@ -83,6 +86,7 @@ fn main() -> Result<()> {
         Task::Test { only, pytest } => stage::run_all(&only, &pytest),
         Task::Demo { problem, seed } => demo::run_problem(&problem, seed),
         Task::Campaign(options) => campaign::run_faults(&options),
+        Task::Gpu(options) => gpu::measure(options),
         Task::Licences => licences::check(),
     }
 }

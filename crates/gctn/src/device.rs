@@ -2,7 +2,11 @@
 
 use std::fmt;
 use std::str::FromStr;
+use std::time::Instant;
 
+use tch::{Kind, Tensor};
+
+use crate::network::channels_last;
 use crate::{Device, Error, Precision};
 
 impl Device {
@@ -34,6 +38,54 @@ impl Device {
     pub fn check(self) -> Result<(), Error> {
         self.open().map(drop)
     }
+}
+
+/// What a device computes at best, in 10^12 operations a second (a multiplication and an addition are two): a convolution of 3x3 over
+/// 256 channels at 64x64 cells of 8 samples. On CUDA convolutions of 32-bit floats are rounded to TF32 where the card has it, unless
+/// the environment says NVIDIA_TF32_OVERRIDE=0.
+pub fn convolution_tflops(device: Device, precision: Precision) -> Result<f64, Error> {
+    const SAMPLES: i64 = 8;
+    const CHANNELS: i64 = 256;
+    const EDGE: i64 = 64;
+    crate::apply_threads();
+    let device = device.open()?;
+    let kind = match precision {
+        Precision::F32 => Kind::Float,
+        Precision::Bf16 => Kind::BFloat16,
+    };
+    let numbers = |size: [i64; 4]| {
+        let numbers = Tensor::ones(size, (kind, device)) / 64.0;
+        channels_last(&numbers)
+    };
+    let (x, kernel) = (
+        numbers([SAMPLES, CHANNELS, EDGE, EDGE]),
+        numbers([CHANNELS, CHANNELS, 3, 3]),
+    );
+    let run = |count: u32| -> Result<f64, Error> {
+        let begun = Instant::now();
+        let mut last = 0.0;
+        for index in 0..count {
+            let no_bias = None::<&Tensor>;
+            let y = x.f_conv2d(&kernel, no_bias, [1, 1], [1, 1], [1, 1], 1)?;
+            if index + 1 == count {
+                // Waits for all of them.
+                last = y.f_double_value(&[0, 0, 0, 0])?;
+            }
+        }
+        let seconds = begun.elapsed().as_secs_f64();
+        match last.is_finite() {
+            true => Ok(seconds / f64::from(count)),
+            false => Err(Error::NotFinite {
+                what: "a convolution of ones",
+                step: None,
+            }),
+        }
+    };
+    let once = tch::no_grad(|| run(2).and_then(|_| run(1)))?;
+    // For about a third of a second.
+    let seconds = tch::no_grad(|| run((0.3 / once).clamp(1.0, 10_000.0) as u32))?;
+    let operations = 2 * 9 * SAMPLES * CHANNELS * CHANNELS * EDGE * EDGE;
+    Ok(operations as f64 * 1e-12 / seconds)
 }
 
 impl fmt::Display for Device {
@@ -126,7 +178,11 @@ fn load_cuda() -> Result<(), String> {
         let library = unsafe { Library::open(Some("libtorch_cuda.so"), RTLD_NOW | RTLD_GLOBAL) };
         let library = library.map_err(|error| {
             let source = std::error::Error::source(&error).map(ToString::to_string);
-            format!("libtorch_cuda.so: {}", source.unwrap_or(error.to_string()))
+            let reason = source.unwrap_or(error.to_string());
+            match reason.starts_with("libtorch_cuda.so") {
+                true => reason,
+                false => format!("libtorch_cuda.so: {reason}"),
+            }
         })?;
         std::mem::forget(library);
         Ok(())

@@ -29,6 +29,7 @@ pub use config::{
     Interpolation, Matching, Network, NetworkConfig, PlaceLoss, Precision, Resnet43, Schedule,
     SensorNoise, TrainingConfig,
 };
+pub use device::convolution_tflops;
 pub use embedding::{Embedded, Embedding, EmbeddingLoss, EmbeddingTrainer};
 pub use error::Error;
 pub use policy::{Decision, Policy, ScoreMap};

@@ -9,7 +9,7 @@ use crate::candidates::{candidate_loss, turn_shapes};
 use crate::checkpoint::{self, File};
 use crate::input::Label;
 use crate::losses::{done_loss, first_place_loss, pick_loss, place_loss};
-use crate::network::{Builder, Features, Model};
+use crate::network::{Builder, Features, Model, multiplications};
 use crate::optimiser::{self, AdamW, Rate};
 use crate::{Error, ModelCard, NetworkConfig, Policy, Sample, Storage, TrainingConfig};
 
@@ -40,8 +40,9 @@ pub struct Losses {
 impl Losses {
     /// From where they were computed, at once: each reading waits for all that is being computed there.
     fn read([pick, place, done, gradient_norm]: [&Tensor; 4]) -> Result<Self, Error> {
-        let all = [pick, place, done, gradient_norm].map(Tensor::detach);
-        let all = Tensor::f_stack(&all, 0)?.to_kind(Kind::Double);
+        let all = [pick, place, done, gradient_norm];
+        let all = all.map(|number| number.detach().flatten(0, -1));
+        let all = Tensor::f_cat(&all, 0)?.to_kind(Kind::Double);
         let mut numbers = [0.0; 4];
         all.to_device(tch::Device::Cpu)
             .f_copy_data(&mut numbers, 4)?;
@@ -183,6 +184,13 @@ impl Trainer {
         let batch = self.batch_maker().unaugmented(samples)?;
         let [pick, place, done] = tch::no_grad(|| self.forward(batch))?;
         Losses::read([&pick, &place, &done, &done.zeros_like()])
+    }
+
+    /// Multiplications of the convolutions of one forward pass of these samples: what an arithmetic limit is counted from.
+    pub fn multiplications(&self, samples: &[Sample<'_>]) -> Result<u64, Error> {
+        let before = multiplications();
+        self.losses(samples)?;
+        Ok(multiplications() - before)
     }
 
     fn forward(&self, batch: Batch) -> Result<[Tensor; 3], Error> {

@@ -20,7 +20,7 @@ use matching::MatchingNet;
 use resnet43::Resnet43Nets;
 
 pub(crate) use encoder::Encoder;
-pub(crate) use parameters::{Builder, Conv, Init, Parameters};
+pub(crate) use parameters::{Builder, Conv, Init, Parameters, channels_last, multiplications};
 
 /// What a network says about a batch.
 pub(crate) struct Features {

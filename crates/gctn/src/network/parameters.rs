@@ -2,6 +2,7 @@
 
 use rand::RngExt;
 use rand_chacha::{ChaCha8Rng, rand_core::SeedableRng};
+use std::cell::Cell;
 use tch::{Device, Kind, Tensor};
 
 /// How weights start.
@@ -226,12 +227,29 @@ pub(crate) struct Conv {
     padding: i64,
 }
 
+thread_local! {
+    static MULTIPLICATIONS: Cell<u64> = const { Cell::new(0) };
+}
+
+/// How many multiplications the convolutions of this thread have made, forward.
+pub(crate) fn multiplications() -> u64 {
+    MULTIPLICATIONS.get()
+}
+
 impl Conv {
+    /// Each number of the output is a sum over a kernel.
+    fn counted(&self, output: Tensor) -> Tensor {
+        let of_each = self.weight.numel() / self.weight.size()[0] as usize;
+        let count = (output.numel() * of_each) as u64;
+        MULTIPLICATIONS.set(MULTIPLICATIONS.get() + count);
+        output
+    }
+
     /// Convolves in the kind of `x`.
     pub fn forward(&self, x: &Tensor) -> Tensor {
         let [weight, bias] = [&self.weight, &self.bias].map(|tensor| tensor.to_kind(x.kind()));
         let (stride, padding) = ([self.stride; 2], [self.padding; 2]);
-        x.conv2d(&weight, Some(&bias), stride, padding, [1, 1], 1)
+        self.counted(x.conv2d(&weight, Some(&bias), stride, padding, [1, 1], 1))
     }
 
     /// The same as [`Conv::forward`] for a 1x1 kernel at stride 1, as one product of matrices. `x` has its channels last in memory, and
@@ -239,9 +257,8 @@ impl Conv {
     pub fn at_each_cell(&self, x: &Tensor) -> Tensor {
         let [weight, bias] = [&self.weight, &self.bias].map(|tensor| tensor.to_kind(x.kind()));
         let size = x.size();
-        x.permute([0, 2, 3, 1])
-            .reshape([-1, size[1]])
-            .linear(&weight.flatten(1, -1), Some(&bias))
+        let rows = x.permute([0, 2, 3, 1]).reshape([-1, size[1]]);
+        self.counted(rows.linear(&weight.flatten(1, -1), Some(&bias)))
             .view([size[0], size[2], size[3], -1])
             .permute([0, 3, 1, 2])
     }

@@ -209,13 +209,12 @@ impl Hardware {
     fn handle(&mut self, command: Command) -> anyhow::Result<()> {
         match command {
             Command::Driver(Request::Follow(goal)) => {
-                match self.acceptance.follow(goal, self.fault) {
-                    Some((goal, motion)) => self.carry_out(goal, motion)?,
-                    None => {}
+                if let Some((goal, motion)) = self.acceptance.follow(*goal, self.fault) {
+                    self.carry_out(goal, motion)?;
                 }
             }
             Command::Driver(Request::Until(goal)) => {
-                self.acceptance.wait(goal, self.now());
+                self.acceptance.wait(*goal, self.now());
                 self.answer_goals()?;
             }
             Command::Driver(Request::Die) => self.end_driver(),
@@ -246,7 +245,7 @@ impl Hardware {
                 return Some(command);
             }
             Command::Driver(Request::Follow(goal)) => goal.reject(reason),
-            Command::Driver(Request::Until(goal)) => self.acceptance.wait(goal, self.now()),
+            Command::Driver(Request::Until(goal)) => self.acceptance.wait(*goal, self.now()),
             Command::Driver(Request::Die) => return Some(command),
             Command::Driver(Request::SetIo(request, reply)) => self.set_io(&request, reply),
             Command::Reset(request, reply) => {

@@ -38,9 +38,9 @@ impl ActionNames {
 /// What a client asks of the driver.
 pub enum Request {
     /// A goal of the trajectory controller. Dropped, it is rejected.
-    Follow(NewGoal<FollowJointTrajectory>),
+    Follow(Box<NewGoal<FollowJointTrajectory>>),
     /// A goal of `trajectory_until_node`. Dropped, it is rejected.
-    Until(NewGoal<FollowJointTrajectoryUntil>),
+    Until(Box<NewGoal<FollowJointTrajectoryUntil>>),
     /// A request of `set_io`, and where to say whether it was carried out. Dropped, it has failed.
     SetIo(SetIORequest, oneshot::Sender<bool>),
     /// A goal id has come twice: the driver's process ends, as rclcpp has it.
@@ -135,8 +135,8 @@ impl DriverServer {
         let state = &self.state;
         loop {
             tokio::select! {
-                goal = self.follow.recv() => pass_on(Request::Follow(goal)),
-                goal = self.until.recv() => pass_on(Request::Until(goal)),
+                goal = self.follow.recv() => pass_on(Request::Follow(Box::new(goal))),
+                goal = self.until.recv() => pass_on(Request::Until(Box::new(goal))),
                 () = repeated(&mut self.repeats) => {
                     error!("a goal id has come twice: the trajectory controller's process is gone");
                     pass_on(Request::Die);

@@ -105,11 +105,7 @@ impl Run {
                 now,
             ),
             StepOutcome::AtHome => {
-                let text = match result.reason.as_str() {
-                    "" => "The arm is at home.".to_owned(),
-                    reason => sentence(&format!("the arm is at home: {reason}")),
-                };
-                self.note("note", text, "", now);
+                self.note("note", "The arm is at home.", "", now);
                 return;
             }
             StepOutcome::NotHome => {

@@ -8,13 +8,14 @@ use msgs::ur_msgs::{
     FollowJointTrajectoryUntilGoal, FollowJointTrajectoryUntilResult, SetIORequest,
 };
 use node_kit::GoalStatus;
-use pick_place::{ContactSign, Robot};
+use pick_place::Robot;
 use tokio::runtime::Handle;
 use tokio::time::timeout;
 use tokio_util::sync::CancellationToken;
 use tracing::debug;
 use ur5::{JointTrajectory, Joints};
 
+use crate::ContactSign;
 use crate::readiness::Readiness;
 use crate::status::DriverStatus;
 use crate::{DriverClient, DriverError};
@@ -47,7 +48,7 @@ impl DriverRobot {
 
     /// Refuses to go on where it must not.
     fn check(&self) -> Result<(), DriverError> {
-        if self.stop.is_cancelled() || self.client.is_disabled_since(self.begun) {
+        if self.stop.is_cancelled() {
             return Err(DriverError::Stopped);
         }
         if let Some(obstacle) = self.client.obstacle() {

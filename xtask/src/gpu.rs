@@ -71,6 +71,9 @@ struct Host {
     begun: Instant,
 }
 
+/// What is found out on a host.
+type Part = fn(&Host) -> Result<Value>;
+
 /// Measures, and writes the file. Fails where a part failed; the file is there in any case, and says which.
 pub fn measure(options: Options) -> Result<()> {
     let host = Host::new(options)?;
@@ -84,7 +87,7 @@ pub fn measure(options: Options) -> Result<()> {
         "libraries": host.libraries,
         "minutes": host.options.minutes,
     });
-    let parts: [(&str, fn(&Host) -> Result<Value>); 3] = [
+    let parts: [(&str, Part); 3] = [
         ("parity", Host::parity),
         ("speed", Host::speed),
         ("trainings", Host::trainings),

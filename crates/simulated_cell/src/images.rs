@@ -133,7 +133,11 @@ mod tests {
     fn noisy_cameras_take_as_many_sets_as_their_model_says_each_image_with_noise_of_its_own() {
         let model = include_str!("../../../config/perturbations/realsense.yaml");
         let taken = shots(Some(model));
-        assert!(taken.len() > 3 && taken.len() % 3 == 0, "{}", taken.len());
+        assert!(
+            taken.len() > 3 && taken.len().is_multiple_of(3),
+            "{}",
+            taken.len()
+        );
         for (count, shot) in taken.iter().enumerate() {
             assert_eq!((shot.0, shot.1), (count / 3, count % 3));
             let since = shot.2 - taken[0].2;

@@ -527,7 +527,7 @@ mod tests {
         let (mut world, mut task) = laid(&round_both(Vector2::zeros()));
         rest(&mut world);
         assert_eq!(task.reached(&world), 2);
-        let mut rng = ChaCha8Rng::seed_from_u64(0);
+        let rng = ChaCha8Rng::seed_from_u64(0);
         let next = task.demonstrate(&Cell::around(&world), &mut rng.into(), None);
         assert!(next.is_none());
     }
@@ -681,7 +681,7 @@ mod tests {
         let (world, mut task) = drawn(3);
         let before = world.state_hash();
         let actions = [0, 0, 1].map(|seed| {
-            let mut rng = ChaCha8Rng::seed_from_u64(seed);
+            let rng = ChaCha8Rng::seed_from_u64(seed);
             task.demonstrate(&Cell::around(&world), &mut rng.into(), None)
                 .map(|next| next.action)
         });

@@ -406,7 +406,7 @@ mod tests {
             rest(&mut world);
             assert_eq!(task.reached(&world), count + 1);
         }
-        let mut rng = ChaCha8Rng::seed_from_u64(0);
+        let rng = ChaCha8Rng::seed_from_u64(0);
         let next = task.demonstrate(&crate::Cell::around(&world), &mut rng.into(), None);
         assert!(next.is_none());
     }
@@ -523,7 +523,7 @@ mod tests {
         #[test]
         fn the_demonstrator_brings_a_disk_onto_a_free_cell_of_its_parity(seed in 0u64..1_000_000) {
             let (world, mut task) = scene(seed);
-            let mut rng = ChaCha8Rng::seed_from_u64(seed);
+            let rng = ChaCha8Rng::seed_from_u64(seed);
             let cell = crate::Cell::around(&world);
             let action = task.demonstrate(&cell, &mut rng.into(), None).unwrap().action;
             let pick = Point2::from(action.pick.translation.vector);

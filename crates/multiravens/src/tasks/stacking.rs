@@ -414,7 +414,7 @@ mod tests {
             rest(&mut world);
             assert_eq!(task.reached(&world), goal + 1);
         }
-        let mut rng = ChaCha8Rng::seed_from_u64(0);
+        let rng = ChaCha8Rng::seed_from_u64(0);
         let next = task.demonstrate(&Cell::around(&world), &mut rng.into(), None);
         assert!(next.is_none());
     }
@@ -439,7 +439,7 @@ mod tests {
         rest(&mut world);
         assert_eq!(task.reached(&world), 2);
         // There is no way to go on but to take the tower down, from its top.
-        let mut rng = ChaCha8Rng::seed_from_u64(0);
+        let rng = ChaCha8Rng::seed_from_u64(0);
         let next = task.demonstrate(&Cell::around(&world), &mut rng.into(), None);
         let pick = next.unwrap().action.pick.translation.vector;
         let top = world.position(task.goals[4].block).xy();
@@ -579,7 +579,7 @@ mod tests {
         #[test]
         fn the_demonstrator_turns_a_block_of_the_lowest_row_square_to_the_stand(seed in 0u64..1_000_000) {
             let (mut world, mut task) = scene(seed);
-            let mut rng = ChaCha8Rng::seed_from_u64(seed);
+            let rng = ChaCha8Rng::seed_from_u64(seed);
             let cell = Cell::around(&world);
             let action = task.demonstrate(&cell, &mut rng.into(), None).unwrap().action;
             let turn = action.place.rotation.angle();

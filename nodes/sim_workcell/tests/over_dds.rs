@@ -8,6 +8,9 @@ use msgs::control_msgs::{
     FollowJointTrajectory, FollowJointTrajectoryGoal, FollowJointTrajectoryResult,
 };
 use msgs::convert;
+use msgs::rcl_interfaces::{
+    Parameter, ParameterType, ParameterValue, SetParameters, SetParametersRequest,
+};
 use msgs::sensor_msgs::{Image, JointState};
 use msgs::ur_dashboard_msgs::{RobotMode, SafetyMode};
 use msgs::ur_msgs::{IOStates, SetIO, SetIORequest};
@@ -256,4 +259,66 @@ async fn who_comes_late_hears_the_status_and_sees_the_frames_and_nothing_while_t
     let after = within("frame", color.recv()).await;
     assert!(after.header.stamp.sec > first.header.stamp.sec);
     sim.shutdown();
+}
+
+/// Sets the parameter `hardware.fault` of the node.
+async fn set_fault(node: &Node, fault: &str) {
+    let client = node
+        .service_client::<SetParameters>("sim_workcell/set_parameters")
+        .unwrap();
+    client.wait_for_server(PATIENCE).await.unwrap();
+    let value = ParameterValue {
+        r#type: ParameterType::PARAMETER_STRING,
+        string_value: fault.to_owned(),
+        ..Default::default()
+    };
+    let parameter = Parameter {
+        name: "hardware.fault".to_owned(),
+        value,
+    };
+    let request = SetParametersRequest {
+        parameters: vec![parameter],
+    };
+    let answer = client.call(&request, &CallOptions::default()).await;
+    assert!(answer.unwrap().results[0].successful);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn what_was_asked_of_a_dead_driver_is_not_done_once_it_is_started_again() {
+    let (_sim, _own, node) = start(&[]);
+    let mut io_states = node
+        .subscription::<IOStates>("io_and_status_controller/io_states", Qos::Event)
+        .unwrap();
+    let set_io = node.service_client::<SetIO>(SET_IO).unwrap();
+    set_io.wait_for_server(PATIENCE).await.unwrap();
+    within("io_states", io_states.recv()).await;
+    let request = |pin| SetIORequest {
+        fun: SetIORequest::FUN_SET_DIGITAL_OUT,
+        pin,
+        state: 1.0,
+    };
+    set_fault(&node, "driver_dead").await;
+    // Each waits behind the one before, as repeated calls do.
+    let impatient = CallOptions {
+        attempts: 3,
+        timeout: Duration::from_millis(200),
+    };
+    while set_io.call(&request(2), &impatient).await.is_ok() {}
+    for pin in [3, 4] {
+        assert!(set_io.call(&request(pin), &impatient).await.is_err());
+    }
+    set_fault(&node, "none").await;
+    let answer = set_io.call(&request(5), &CallOptions::default()).await;
+    assert!(answer.unwrap().success);
+    let is_high = |states: &IOStates, number| {
+        let mut pins = states.digital_out_states.iter();
+        pins.any(|pin| pin.pin == number && pin.state)
+    };
+    loop {
+        let states = within("io_states", io_states.recv()).await;
+        assert!(!is_high(&states, 3) && !is_high(&states, 4), "{states:?}");
+        if is_high(&states, 5) {
+            break;
+        }
+    }
 }

@@ -1,7 +1,6 @@
 //! The driver's actions and services.
 
 use std::convert::Infallible;
-use std::sync::atomic::{AtomicBool, Ordering};
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
 use driver_model::{Controllers, HardwareSettings};
@@ -49,8 +48,8 @@ pub enum Request {
 
 /// What the driver's services and whoever moves the arm share.
 pub struct DriverState {
-    /// The driver's process is gone.
-    dead: AtomicBool,
+    /// Whether the driver's process is gone.
+    dead: watch::Sender<bool>,
     controllers: Mutex<Controllers>,
 }
 
@@ -63,18 +62,24 @@ impl DriverState {
             hardware.software_major,
         );
         Self {
-            dead: AtomicBool::new(false),
+            dead: watch::channel(false).0,
             controllers: Mutex::new(controllers),
         }
     }
 
-    /// A dead driver answers nothing.
+    /// A dead driver answers nothing, and does not know of what was asked meanwhile when it is started again.
     pub fn set_dead(&self, dead: bool) {
-        self.dead.store(dead, Ordering::Release);
+        self.dead.send_replace(dead);
     }
 
     fn is_dead(&self) -> bool {
-        self.dead.load(Ordering::Acquire)
+        *self.dead.borrow()
+    }
+
+    /// Waits until the driver is dead.
+    async fn death(&self) {
+        // The sender lives as long as this.
+        let _ = self.dead.subscribe().wait_for(|dead| *dead).await;
     }
 
     pub(crate) fn controllers(&self) -> MutexGuard<'_, Controllers> {
@@ -141,13 +146,18 @@ impl DriverServer {
                     error!("a goal id has come twice: the trajectory controller's process is gone");
                     pass_on(Request::Die);
                 }
-                (id, request) = self.set_io.recv() => {
+                (id, request) = self.set_io.recv() => if !state.is_dead() {
                     let (reply, replied) = oneshot::channel();
                     pass_on(Request::SetIo(request, reply));
-                    // Dropped where the request was not taken; a dead driver does not answer.
-                    let success = replied.await.unwrap_or(false);
-                    self.set_io.respond(id, SetIOResponse { success });
-                }
+                    tokio::select! {
+                        // Dropped where the request was not taken.
+                        success = replied => {
+                            let success = success.unwrap_or(false);
+                            self.set_io.respond(id, SetIOResponse { success });
+                        }
+                        () = state.death() => {}
+                    }
+                },
                 (id, _) = self.list.recv() => if !state.is_dead() {
                     self.list.respond(id, controllers_to_msg(&state.controllers()));
                 },

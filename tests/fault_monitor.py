@@ -81,7 +81,8 @@ class Monitor:
     _voided: dict[int, str] = dataclasses.field(default_factory=dict)
     # Status of each goal of each action of the driver.
     _goals: dict[str, dict[bytes, int]] = dataclasses.field(default_factory=dict)
-    # Whether nothing was under way when the stop came: only then can a goal be on its way to the driver.
+    # Whether a goal can be on its way to the driver: nothing was under way when the stop came, or what was has ended by itself
+    # before the stop acted.
     _may_be_unanswered: bool = False
     # When a goal that was on its way was accepted after the stop, and where the arm was.
     _late_goal_at: float | None = None
@@ -157,6 +158,8 @@ class Monitor:
         under_way = [goal for goal, status in statuses.items() if status in UNDER_WAY]
         if new and (replaced or len(under_way) > 1):
             self._violate(Kind.TWO_GOALS, "a goal takes the place of one under way: two executors act on one approval", now)
+        if any(status == SUCCEEDED and before.get(goal) in UNDER_WAY for goal, status in statuses.items()):
+            self._on_own_end(now)
         # Only the newest statuses of an action are kept: that it was under way may never have been heard.
         accepted = new or [goal for goal, status in statuses.items() if goal not in before and status == CANCELED]
         if accepted and answers_late and self._may_be_unanswered and self._stopped_at is not None:
@@ -165,6 +168,12 @@ class Monitor:
                 self._late_goal_at, self._late_from = now, self._positions
                 # The first readings of its motion may have overtaken the news of it.
                 self.violations[:] = [found for found in self.violations if not self._is_overtaking(found, now)]
+
+    def _on_own_end(self, now: float) -> None:
+        """A goal has succeeded: the executor may have sent the next one before it has heard of a stop that was said meanwhile."""
+        none_is_under_way = not any(status in UNDER_WAY for goals in self._goals.values() for status in goals.values())
+        if self._stopped_at is not None and self._late_goal_at is None and now - self._stopped_at <= self._limit_s:
+            self._may_be_unanswered |= none_is_under_way
 
     def on_lost_sight(self) -> None:
         """The driver says nothing any more: where the arm has come to rest meanwhile is not known before the next reading."""

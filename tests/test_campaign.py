@@ -188,6 +188,23 @@ def test_a_goal_that_is_accepted_after_a_stop_may_move_the_arm_slowly_until_it_i
     assert [found.kind for found in monitor.violations] == [Kind.AFTER_STOP]
 
 
+def test_a_goal_may_follow_one_that_ends_by_itself_as_the_stop_comes_and_no_other(monitor: Monitor) -> None:
+    monitor.on_approval(2, "anna")
+    monitor.on_goals("follow", {b"a": 2}, 0.5)
+    move(monitor, 1.0)
+    monitor.on_stop(1.0, 0.3)
+    # It was at its end; the next descent was sent before the executor has heard of the stop.
+    monitor.on_goals("follow", {b"a": 4}, 1.1)
+    monitor.on_goals("until", {b"b": 2}, 1.4, answers_late=True)
+    descend(monitor, 1.4, 1.7)
+    assert not monitor.violations
+    # Not twice.
+    monitor.on_goals("until", {b"b": 4}, 1.7)
+    monitor.on_goals("until", {b"b": 4, b"c": 2}, 2.0, answers_late=True)
+    descend(monitor, 2.0, 2.3)
+    assert Kind.AFTER_STOP in [found.kind for found in monitor.violations]
+
+
 def test_the_first_readings_of_a_late_motion_may_overtake_the_news_of_its_goal(monitor: Monitor) -> None:
     stopped_before_an_answer(monitor)
     monitor.on_joints([1.01, 0.0], 1.98)

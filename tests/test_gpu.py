@@ -32,7 +32,7 @@ def test_the_script_for_a_gpu_runs_on_the_processor_and_one_file_comes_back(tmp_
     recipe, out = tmp_path / "tiny.yaml", tmp_path / "gpu.json"
     recipe.write_text(RECIPE)
     bench = "--bench=--networks compact --batches 1,2 --steps 2"
-    run = xtask_gpu("--device", "cpu", "--minutes", 0.4, "--recipes", recipe, "--problems", "placing", "--demonstrations", 1,
+    run = xtask_gpu("--device", "cpu", "--minutes", 1.0, "--recipes", recipe, "--problems", "placing", "--demonstrations", 1,
                     "--episodes", 1, "--out", out, bench)  # fmt: skip
     assert run.returncode == 0, run.stdout + run.stderr
     report = json.loads(out.read_text())

@@ -52,6 +52,8 @@ WATCH_S = 2.5
 LATEST_S = 9.0
 # The last messages arrive within this time.
 LAST_MESSAGES_S = 0.2
+# How much of the executor's log is shown after a violation.
+LOG_CHARACTERS = 3000
 # Faults that follow each other in one cell.
 FAULTS_OF_A_CELL = 8
 
@@ -126,6 +128,8 @@ class Injected:
     hung: str = ""
     # The kinds and words of what must not happen.
     violations: list[tuple[str, str]] = dataclasses.field(default_factory=list)
+    # What the monitor heard before the first of them.
+    history: list[str] = dataclasses.field(default_factory=list)
 
 
 def run_cells(faults: list[Planned], seed: int, until_s: float = float("inf")) -> Iterator[Injected]:
@@ -151,7 +155,11 @@ def run_cells(faults: list[Planned], seed: int, until_s: float = float("inf")) -
                     # What is on its way comes.
                     bench.operator.spin(LAST_MESSAGES_S)
                     bench.settle()
-                    line.violations = [(found.kind.value, found.text) for found in bench.monitor.violations[known:]][:5]
+                    found = bench.monitor.violations[known:]
+                    line.violations = [(violation.kind.value, violation.text) for violation in found][:5]
+                    if found:
+                        line.history = found[0].history
+                        print(f"the executor's log:\n{bench.executor.log()[-LOG_CHARACTERS:]}", file=sys.stderr, flush=True)
                     print(f"{json.dumps(dataclasses.asdict(line))}", file=sys.stderr, flush=True)
                     yield line
         except TimeoutError as error:

@@ -181,11 +181,12 @@ def watch(bench: Bench) -> None:
 
     def on_confirmation(said: StepConfirmation) -> None:
         if said.decision == StepConfirmation.APPROVE:
-            bench.happened(time.monotonic(), lambda: monitor.on_approval(said.proposal_id, said.operator_name))
+            now = time.monotonic()
+            bench.happened(now, lambda: monitor.on_approval(said.proposal_id, said.operator_name, now))
 
     def on_confirmation_of_others(said: StepConfirmation, info: dict[str, int]) -> None:
         if said.operator_name != OPERATOR and said.decision == StepConfirmation.APPROVE:
-            bench.happened(sent_at(info), lambda: monitor.on_approval(said.proposal_id, said.operator_name))
+            bench.happened(sent_at(info), lambda: monitor.on_approval(said.proposal_id, said.operator_name, sent_at(info)))
 
     def on_proposal(made: PickPlace, info: dict[str, int]) -> None:
         bench.happened(sent_at(info), lambda: monitor.on_proposal(made.id))

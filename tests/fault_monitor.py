@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import collections
 import dataclasses
 import enum
 from collections.abc import Mapping
@@ -23,6 +24,8 @@ LATE_GOAL_S = 0.3
 LATE_GOAL_RAD = 0.05
 # The driver says so within this time of the beginning of the motion.
 NEWS_S = 0.15
+# How many events a violation is shown with.
+HISTORY_LENGTH = 24
 # A driver has accepted by then whatever it was sent before a stop: within 2 s, until_answer_max_s of config/hardware/realistic.yaml,
 # after it has reached it, which a driver that stood still or a network that was parted delays by as much.
 ANSWER_S = 4.0
@@ -49,6 +52,8 @@ class Violation:
     text: str
     # When it was seen [s].
     at_s: float
+    # What the monitor heard before it, the newest last.
+    history: list[str] = dataclasses.field(default_factory=list)
 
     def __str__(self) -> str:
         return self.text
@@ -87,6 +92,8 @@ class Monitor:
     # When a goal that was on its way was accepted after the stop, and where the arm was.
     _late_goal_at: float | None = None
     _late_from: list[float] | None = None
+    # What was heard, and when.
+    _history: collections.deque[tuple[float, str]] = dataclasses.field(default_factory=lambda: collections.deque(maxlen=HISTORY_LENGTH))
 
     def on_proposal(self, proposal_id: int) -> None:
         """The newest proposal replaces the one before, but not the one that is being carried out."""
@@ -103,8 +110,9 @@ class Monitor:
         """A proposal must not move the arm even where it is approved."""
         self._voided[proposal_id] = reason
 
-    def on_approval(self, proposal_id: int, operator: str) -> None:
+    def on_approval(self, proposal_id: int, operator: str, now: float = 0.0) -> None:
         """Only the deciding operator's first approval of the newest proposal lets the arm move."""
+        self._hear(f"{operator} approves {proposal_id}", now)
         if operator != self.deciding_operator:
             self._void.append(f"the approval of proposal {proposal_id} came from {operator}, who does not decide")
         elif proposal_id in self._used:
@@ -124,6 +132,7 @@ class Monitor:
 
         The first counts, unless the arm could not move before: its driver stood still and goes on `again`.
         """
+        self._hear(f"stop, to rest within {limit_s:.1f} s", now)
         if self._stopped_at is None or again:
             self._stopped_at, self._limit_s, self.rest_after_s = now, limit_s, 0.0
             self._void = []
@@ -132,12 +141,15 @@ class Monitor:
 
     def on_end(self, proposal_id: int, now: float) -> None:
         """The executor says that a motion has ended: nothing moves any more."""
+        self._hear(f"end of {proposal_id}", now)
         if proposal_id == self._moving:
             self.on_stop(now, 0.0)
 
     def on_suction(self, on: bool, now: float) -> None:
         """A reading of the output that switches suction: a stop leaves it as it is."""
         was_on, self._suction = self._suction, on
+        if on != was_on:
+            self._hear(f"suction {'on' if on else 'off'}", now)
         if on and not was_on:
             self._is_placed = False
         released = self._is_placed and self._stopped_at is not None and now - self._stopped_at <= RELEASE_S
@@ -151,6 +163,9 @@ class Monitor:
         Where the driver takes its time to answer, one goal from before a stop may be accepted after it.
         """
         before = self._goals.get(action, {})
+        changed = {goal.hex()[:4]: status for goal, status in statuses.items() if before.get(goal) != status}
+        if changed:
+            self._hear(f"{action}: {changed}", now)
         self._goals[action] = dict(statuses)
         self._is_placed |= answers_late and any(status == SUCCEEDED and before.get(goal) != SUCCEEDED for goal, status in statuses.items())
         new = [goal for goal, status in statuses.items() if goal not in before and status in UNDER_WAY]
@@ -187,6 +202,8 @@ class Monitor:
         if max(abs(a - b) for a, b in zip(positions, self._positions, strict=True)) <= MOVING_RAD:
             return
         rested = now - self._moved_at > REST_TIME_S
+        if rested:
+            self._hear(f"moves, after a rest of {now - self._moved_at:.3f} s", now)
         self._positions, self._moved_at = list(positions), now
         if self._moving is None:
             self._violate(Kind.UNAPPROVED, f"the arm moves without an approval: {'; '.join(self._void) or 'there is none'}", now)
@@ -213,5 +230,9 @@ class Monitor:
         """Whether a violation is a motion that began just before now."""
         return found.kind in (Kind.AFTER_STOP, Kind.UNAPPROVED) and now - found.at_s <= NEWS_S and self._moving is not None
 
+    def _hear(self, text: str, now: float) -> None:
+        self._history.append((now, text))
+
     def _violate(self, kind: Kind, text: str, now: float) -> None:
-        self.violations.append(Violation(kind, text, now))
+        history = [f"{at_s - now:.3f} s: {said}" for at_s, said in self._history]
+        self.violations.append(Violation(kind, text, now, history))

@@ -137,7 +137,7 @@ impl DriverClient {
             return false;
         };
         // Where simulated time stands still, so does the arm.
-        let at_rest = (self.clock.is_simulated() && still.in_time)
+        let at_rest = (self.clock.is_simulated() && status.stands_in_time(self.clock.now_ns()))
             || joints.at.saturating_sub(still.since.max(since)) >= self.rest_time();
         joints.at >= since && at_rest
     }

@@ -65,7 +65,7 @@ pub struct DriverStatus {
 pub struct Still {
     /// Arrival of the first.
     pub since: Duration,
-    /// The last two have the same stamp: simulated time stands still, too.
+    /// The last two have the same stamp.
     pub in_time: bool,
 }
 
@@ -102,6 +102,14 @@ impl DriverStatus {
             in_time,
         });
         self.joints = Some(Newest::next(before, reading, at));
+    }
+
+    /// Whether the joints stand still because simulated time does: the last two readings are of the time that the clock shows.
+    /// A driver whose time is not that of the clock may stamp two readings of an arm that is about to move alike.
+    pub fn stands_in_time(&self, clock_ns: i64) -> bool {
+        let at_rest_in_time = self.still.is_some_and(|still| still.in_time);
+        let reading = self.joints.map(|joints| joints.value.stamp.as_nanos());
+        at_rest_in_time && reading == u128::try_from(clock_ns).ok()
     }
 
     /// Takes the next state of the pins.
@@ -307,6 +315,24 @@ mod tests {
             ..ready
         };
         assert_eq!(reduced.obstacle(now, AGE), None);
+    }
+
+    #[test]
+    fn two_readings_of_one_time_are_an_arm_at_rest_only_where_the_clock_shows_that_time() {
+        let rule = StillRule {
+            speed_rad_s: 1e-3,
+            step_rad: 1e-4,
+            pause: AGE,
+            home_rad: Joints::repeat(1.1),
+        };
+        let mut status = ready(Duration::ZERO);
+        let reading = status.joints.unwrap().value;
+        assert!(!status.stands_in_time(5_000_000_000));
+        status.read_joints(reading, Duration::ZERO, &rule);
+        assert!(status.stands_in_time(5_000_000_000));
+        // Of a clock that is not the driver's.
+        assert!(!status.stands_in_time(5_000_000_001));
+        assert!(!status.stands_in_time(-1));
     }
 
     #[test]

@@ -208,8 +208,9 @@ def clock_jumps(bench: Bench) -> None:
 
 def partition(bench: Bench) -> None:
     """The executor's host is cut off: the watchdog on the driver's host stops the arm."""
-    bench.stopped(REST_AFTER_DEATH_S)
+    # From when the link is cut: until then the executor acts, also where the machine is busy.
     bench.link.lose(1.0)
+    bench.stopped(REST_AFTER_DEATH_S)
     bench.operator.spin(2.0)
     bench.link.lose(0.0)
 

@@ -79,6 +79,8 @@ class Monitor:
     _limit_s: float = 0.0
     _positions: list[float] | None = None
     _moved_at: float = 0.0
+    # Where the arm was when it last was allowed to move: nothing where it is not any more, and its motion is measured from there.
+    _allowed_at: list[float] | None = None
     _suction: bool = False
     # Whether a descent has ended at contact since suction was switched on.
     _is_placed: bool = False
@@ -176,7 +178,7 @@ class Monitor:
         if any(status == SUCCEEDED and before.get(goal) in UNDER_WAY for goal, status in statuses.items()):
             self._on_own_end(now)
         # Only the newest statuses of an action are kept: that it was under way may never have been heard.
-        accepted = new or [goal for goal, status in statuses.items() if goal not in before and status == CANCELED]
+        accepted = statuses.keys() - before.keys()
         if accepted and answers_late and self._may_be_unanswered and self._stopped_at is not None:
             self._may_be_unanswered = False
             if now - self._stopped_at <= ANSWER_S + OVERTAKING_S:
@@ -192,13 +194,18 @@ class Monitor:
 
     def on_lost_sight(self) -> None:
         """The driver says nothing any more: where the arm has come to rest meanwhile is not known before the next reading."""
-        self._positions = None
+        self._positions = self._allowed_at = None
 
     def on_joints(self, positions: list[float], now: float) -> None:
         """A reading of the joints."""
         if self._positions is None:
             self._positions = list(positions)
             return
+        if self._may_move(now):
+            self._allowed_at = list(positions)
+        elif self._allowed_at is not None:
+            # What it had moved by then was allowed, also where that was too little to be seen above the noise.
+            self._positions, self._allowed_at = self._allowed_at, None
         if max(abs(a - b) for a, b in zip(positions, self._positions, strict=True)) <= MOVING_RAD:
             return
         rested = now - self._moved_at > REST_TIME_S
@@ -209,7 +216,7 @@ class Monitor:
             self._violate(Kind.UNAPPROVED, f"the arm moves without an approval: {'; '.join(self._void) or 'there is none'}", now)
         elif self._stopped_at is not None:
             after_s = now - self._stopped_at
-            late = after_s > self._limit_s + OVERTAKING_S and not self._is_of_late_goal(positions, now)
+            late = not self._may_move(now) or self._is_too_far_for_late_goal(positions, now)
             if late and self._void:
                 self._violate(Kind.UNAPPROVED, f"the arm moves {after_s:.2f} s after it had to stop: {'; '.join(self._void)}", now)
             elif late and rested:
@@ -220,11 +227,23 @@ class Monitor:
             if not rested:
                 self.rest_after_s = after_s
 
-    def _is_of_late_goal(self, positions: list[float], now: float) -> bool:
-        """Whether the arm may move here because a goal was accepted after the stop and is being cancelled."""
-        if self._late_goal_at is None or now - self._late_goal_at > LATE_GOAL_S + OVERTAKING_S:
+    def _may_move(self, now: float) -> bool:
+        """Whether the arm may move: on an approval, while it brakes after a stop, and while a goal that was accepted late is cancelled."""
+        if self._moving is None:
             return False
-        return self._late_from is None or max(abs(a - b) for a, b in zip(positions, self._late_from, strict=True)) <= LATE_GOAL_RAD
+        return self._stopped_at is None or self._is_braking(now) or self._has_late_goal(now)
+
+    def _is_braking(self, now: float) -> bool:
+        return self._stopped_at is not None and now - self._stopped_at <= self._limit_s + OVERTAKING_S
+
+    def _has_late_goal(self, now: float) -> bool:
+        return self._late_goal_at is not None and now - self._late_goal_at <= LATE_GOAL_S + OVERTAKING_S
+
+    def _is_too_far_for_late_goal(self, positions: list[float], now: float) -> bool:
+        """Whether the arm moves for a goal that was accepted late, further than that one brings it before it is cancelled."""
+        if self._is_braking(now) or not self._has_late_goal(now) or self._late_from is None:
+            return False
+        return max(abs(a - b) for a, b in zip(positions, self._late_from, strict=True)) > LATE_GOAL_RAD
 
     def _is_overtaking(self, found: Violation, now: float) -> bool:
         """Whether a violation is a motion that began just before now."""

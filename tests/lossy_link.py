@@ -55,9 +55,12 @@ class Link:
         self.prefix = ["nsenter", f"--net=/proc/{process.pid}/ns/net"]
 
     def lose(self, share: float) -> None:
-        """Loses this share of all datagrams from now on, in both directions: 1 parts the hosts."""
+        """Loses this share of all datagrams, in both directions: 1 parts the hosts. It does so when this returns."""
         self._process.stdin.write(f"{share}\n")
         self._process.stdin.flush()
+        said = self._process.stdout.readline()
+        if said != f"{share}\n":
+            raise RuntimeError(f"the link said {said!r}, expected that it loses {share}")
 
 
 @contextlib.contextmanager
@@ -94,7 +97,8 @@ def _carry(devices: tuple[int, int], draw: random.Random) -> None:
                 said = os.read(source, 1000).decode()
                 if not said:
                     return
-                share = float(said.split()[-1])
+                share = float(said)
+                print(share, flush=True)
                 continue
             frame = os.read(source, MTU + 100)
             if draw.random() >= share:

@@ -7,7 +7,7 @@ import subprocess
 import sys
 
 import pytest
-from fault_monitor import Kind, Monitor
+from fault_monitor import ABORTED, CANCELED, SUCCEEDED, Kind, Monitor
 from processes import BINARIES, REPOSITORY
 
 # Each takes some 11 s, a fifth of a core; `cargo xtask campaign` takes any number.
@@ -71,6 +71,31 @@ def test_the_monitor_catches_a_motion_that_begins_again_by_itself(monitor: Monit
     move(monitor, 3.0)
     assert [found.kind for found in monitor.violations] == [Kind.AFTER_STOP]
     assert "begins to move again 1.90 s after" in str(monitor.violations[0])
+
+
+def test_what_is_left_of_a_motion_when_it_settles_is_no_other_motion(monitor: Monitor) -> None:
+    monitor.on_approval(2, "anna")
+    move(monitor, 1.0)
+    monitor.on_stop(1.1, 0.3)
+    move(monitor, 1.2)
+    # It creeps on by less than what counts as a motion, and stays there with the noise of its encoders.
+    for step in range(100):
+        monitor.on_joints([1.2 + 0.00048, 0.00004 * (step % 2)], 1.21 + 0.02 * step)
+    monitor.on_joints([1.2 + 0.00052, 0.0], 3.3)
+    assert not monitor.violations
+    monitor.on_joints([1.2 + 0.00102, 0.0], 3.4)
+    assert [found.kind for found in monitor.violations] == [Kind.AFTER_STOP]
+
+
+def test_too_little_to_be_seen_that_was_allowed_is_no_motion_when_noise_is_added_to_it(monitor: Monitor) -> None:
+    monitor.on_approval(2, "anna")
+    monitor.on_joints([0.00048, 0.0], 1.0)
+    monitor.on_stop(1.0, 0.3)
+    monitor.on_joints([0.00049, 0.0], 1.2)
+    monitor.on_joints([0.00052, 0.0], 2.0)
+    assert not monitor.violations
+    monitor.on_joints([0.00102, 0.0], 2.1)
+    assert [found.kind for found in monitor.violations] == [Kind.AFTER_STOP]
 
 
 def test_the_monitor_catches_a_slow_motion(monitor: Monitor) -> None:
@@ -212,9 +237,10 @@ def test_the_first_readings_of_a_late_motion_may_overtake_the_news_of_its_goal(m
     assert not monitor.violations
 
 
-def test_a_late_goal_that_is_first_heard_of_when_it_is_cancelled_is_a_late_goal(monitor: Monitor) -> None:
+@pytest.mark.parametrize("status", [SUCCEEDED, CANCELED, ABORTED])
+def test_a_late_goal_that_is_first_heard_of_when_it_has_ended_is_a_late_goal(monitor: Monitor, status: int) -> None:
     stopped_before_an_answer(monitor)
-    monitor.on_goals("until", {b"b": 5}, 2.0, answers_late=True)
+    monitor.on_goals("until", {b"b": status}, 2.0, answers_late=True)
     descend(monitor, 2.0, 2.3)
     assert not monitor.violations
 
@@ -263,8 +289,12 @@ def test_the_monitor_catches_a_motion_on_an_approval_that_must_not_count(monitor
 
 
 def test_the_monitor_takes_an_arm_that_was_not_seen_for_one_that_may_stand_elsewhere(monitor: Monitor) -> None:
+    monitor.on_approval(2, "anna")
+    move(monitor, 1.0)
+    monitor.on_stop(1.1, 0.3)
     monitor.on_lost_sight()
     monitor.on_joints([0.5, 0.0], 5.0)
+    monitor.on_joints([0.5, 0.0], 5.01)
     assert not monitor.violations
     move(monitor, 5.1)
     assert monitor.violations

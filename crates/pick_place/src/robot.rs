@@ -110,6 +110,8 @@ pub fn go_home<R: Robot>(
     if !robot.follow(&way).map_err(robot_error(phase))? {
         return Err(PrimitiveError::Blocked { phase }.into());
     }
+    // At home is an arm that rests there.
+    robot.joints().map_err(robot_error(phase))?;
     Ok(())
 }
 

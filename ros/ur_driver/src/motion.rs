@@ -18,7 +18,7 @@ use crate::{ContactSign, DriverParameters};
 use crate::{DriverClient, DriverError};
 
 /// How often a motion is looked after.
-const WATCH_PERIOD: Duration = Duration::from_millis(20);
+pub(crate) const WATCH_PERIOD: Duration = Duration::from_millis(20);
 /// How long the answer to a cancel is waited for, and the pause before goals are cancelled again while the arm does not come to rest.
 const CANCEL_PERIOD: Duration = Duration::from_millis(200);
 /// After the time that an action may take to answer, an answer that is still to come is waited for by so much more.

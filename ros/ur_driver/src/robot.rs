@@ -10,12 +10,13 @@ use msgs::ur_msgs::{
 use node_kit::GoalStatus;
 use pick_place::Robot;
 use tokio::runtime::Handle;
-use tokio::time::timeout;
+use tokio::time::{MissedTickBehavior, interval, timeout};
 use tokio_util::sync::CancellationToken;
 use tracing::debug;
 use ur5::{JointTrajectory, Joints};
 
 use crate::ContactSign;
+use crate::motion::WATCH_PERIOD;
 use crate::readiness::Readiness;
 use crate::status::DriverStatus;
 use crate::{DriverClient, DriverError};
@@ -62,6 +63,21 @@ impl DriverRobot {
             )));
         }
         Ok(())
+    }
+
+    /// Waits until the robot must not go on.
+    async fn forbidden(&self) -> DriverError {
+        let mut ticks = interval(WATCH_PERIOD);
+        ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
+        loop {
+            if let Err(reason) = self.check() {
+                return reason;
+            }
+            tokio::select! {
+                () = self.stop.cancelled() => {}
+                _ = ticks.tick() => {}
+            }
+        }
     }
 
     /// Refuses to go on with a driver that lacks something, or whose answer to an earlier goal is still to come. Soon after the start the
@@ -136,7 +152,8 @@ impl DriverRobot {
         Ok(reading.positions_rad)
     }
 
-    /// Switches an output and waits until the driver says that it is switched.
+    /// Switches an output and waits until the driver says that it is switched. A driver that has fallen silent is not asked again: when
+    /// it comes back, what it was asked before does not count any more.
     async fn switch_pin(&self, pin: u8, on: bool) -> Result<(), DriverError> {
         let request = SetIORequest {
             fun: SetIORequest::FUN_SET_DIGITAL_OUT,
@@ -146,7 +163,7 @@ impl DriverRobot {
         let options = self.client.options();
         let response = tokio::select! {
             response = self.client.set_io.call(&request, &options) => response,
-            () = self.stop.cancelled() => return Err(DriverError::Stopped),
+            reason = self.forbidden() => return Err(reason),
         };
         if !response.map_err(DriverError::fault)?.success {
             let level = if on { "on" } else { "off" };

@@ -419,6 +419,37 @@ async fn what_the_driver_lacks_is_refused_by_name() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
+async fn a_driver_that_comes_back_is_not_asked_again_for_what_it_was_asked_before() {
+    let driver = DriverParameters {
+        status_max_age_s: 1.0,
+        ..DriverParameters::default()
+    };
+    let bench = Bench::start(&[], driver).await;
+    let suction = |bench: &Bench| bench.client.status.borrow().pins.unwrap().value.suction;
+    let stop = CancellationToken::new();
+    bench
+        .work(&stop, |robot| robot.set_suction(true))
+        .await
+        .unwrap()
+        .unwrap();
+    bench.set_fault("driver_dead").await;
+    // It is dead by then, and not known to be.
+    tokio::time::sleep(Duration::from_millis(300)).await;
+    let released = bench.work(&stop, |robot| robot.set_suction(false));
+    tokio::time::sleep(Duration::from_millis(2500)).await;
+    bench.set_fault("none").await;
+    let reason = reason(released.await.unwrap());
+    assert!(reason.contains("expected at most 1.0 s"), "{reason}");
+    bench
+        .until("driver that is back", |bench| {
+            bench.client.obstacle().is_none()
+        })
+        .await;
+    tokio::time::sleep(Duration::from_millis(1500)).await;
+    assert!(suction(&bench), "suction was switched off");
+}
+
+#[tokio::test(flavor = "multi_thread")]
 async fn suction_waits_for_the_vacuum_and_the_release_is_verified() {
     let hardware = [
         ("vacuum_build_s", "0.3"),

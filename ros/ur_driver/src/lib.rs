@@ -121,24 +121,19 @@ impl DriverClient {
             .or_else(|| self.readiness.borrow().obstacle())
     }
 
-    /// How long joints have to stand still to count as at rest. A simulator may be slow, and its time may run on.
-    fn rest_time(&self) -> Duration {
-        let rest = Duration::from_secs_f64(self.parameters.rest_time_s);
-        if self.clock.is_simulated() {
-            10 * rest
-        } else {
-            rest
-        }
-    }
-
     /// Whether the arm has stood still since a time, as far as is known.
     fn rests_since(&self, status: &DriverStatus, since: Duration) -> bool {
         let (Some(joints), Some(still)) = (status.joints, status.still) else {
             return false;
         };
-        // Where simulated time stands still, so does the arm.
-        let at_rest = (self.clock.is_simulated() && status.stands_in_time(self.clock.now_ns()))
-            || joints.at.saturating_sub(still.since.max(since)) >= self.rest_time();
+        let rest = Duration::from_secs_f64(self.parameters.rest_time_s);
+        let rested = joints.at.saturating_sub(still.since.max(since));
+        let at_rest = if self.clock.is_simulated() {
+            // A simulator may be slow, and its time may run on. Where it stands still, so does the arm.
+            rested >= 10 * rest || status.stands_in_time(self.clock.now_ns(), rest)
+        } else {
+            rested >= rest
+        };
         joints.at >= since && at_rest
     }
 

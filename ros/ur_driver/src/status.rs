@@ -67,6 +67,8 @@ pub struct Still {
     pub since: Duration,
     /// The last two have the same stamp.
     pub in_time: bool,
+    /// Arrival of the first with the newest stamp.
+    pub stamp_since: Duration,
 }
 
 /// What counts as standing still.
@@ -100,16 +102,25 @@ impl DriverStatus {
         self.still = still.then(|| Still {
             since: self.still.map_or(at, |still| still.since),
             in_time,
+            stamp_since: self
+                .still
+                .filter(|_| in_time)
+                .map_or(at, |still| still.stamp_since),
         });
         self.joints = Some(Newest::next(before, reading, at));
     }
 
-    /// Whether the joints stand still because simulated time does: the last two readings are of the time that the clock shows.
-    /// A driver whose time is not that of the clock may stamp two readings of an arm that is about to move alike.
-    pub fn stands_in_time(&self, clock_ns: i64) -> bool {
-        let at_rest_in_time = self.still.is_some_and(|still| still.in_time);
-        let reading = self.joints.map(|joints| joints.value.stamp.as_nanos());
-        at_rest_in_time && reading == u128::try_from(clock_ns).ok()
+    /// Whether the joints stand still because simulated time does: the last two readings are of the time that the clock shows, or
+    /// readings have had the same stamp for `pause`, where a node that ends hears of no clock any more. A driver whose time is not that
+    /// of the clock may stamp two readings of an arm that is about to move alike.
+    pub fn stands_in_time(&self, clock_ns: i64, pause: Duration) -> bool {
+        let (Some(joints), Some(still)) = (self.joints, self.still) else {
+            return false;
+        };
+        let of_the_clock =
+            u128::try_from(clock_ns).is_ok_and(|now| now == joints.value.stamp.as_nanos());
+        let for_long = joints.at.saturating_sub(still.stamp_since) >= pause;
+        still.in_time && (of_the_clock || for_long)
     }
 
     /// Takes the next state of the pins.
@@ -327,12 +338,24 @@ mod tests {
         };
         let mut status = ready(Duration::ZERO);
         let reading = status.joints.unwrap().value;
-        assert!(!status.stands_in_time(5_000_000_000));
+        let pause = Duration::from_millis(100);
+        assert!(!status.stands_in_time(5_000_000_000, pause));
         status.read_joints(reading, Duration::ZERO, &rule);
-        assert!(status.stands_in_time(5_000_000_000));
+        assert!(status.stands_in_time(5_000_000_000, pause));
         // Of a clock that is not the driver's.
-        assert!(!status.stands_in_time(5_000_000_001));
-        assert!(!status.stands_in_time(-1));
+        assert!(!status.stands_in_time(5_000_000_001, pause));
+        assert!(!status.stands_in_time(-1, pause));
+        // The clock is not heard any more.
+        status.read_joints(reading, Duration::from_millis(99), &rule);
+        assert!(!status.stands_in_time(-1, pause));
+        status.read_joints(reading, Duration::from_millis(100), &rule);
+        assert!(status.stands_in_time(-1, pause));
+        let next = JointReading {
+            stamp: reading.stamp + pause,
+            ..reading
+        };
+        status.read_joints(next, Duration::from_millis(300), &rule);
+        assert!(!status.stands_in_time(-1, pause));
     }
 
     #[test]

@@ -11,15 +11,22 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 import pytest
-from cell_operator import Operator
+from cell_operator import STREAM, Operator
+from geometry_msgs.msg import Pose2D
 from processes import REPOSITORY
+from rcl_interfaces.srv import SetParameters
+from rclpy.parameter import Parameter
 from sctn_msgs.msg import Heightmap, PickPlace, StepConfirmation, StepResult
 from sctn_msgs.srv import ProposeHome
 from test_refusals import Cell
+from ur_msgs.msg import IOStates
 from whole_run import parameters
 
 # Problems, and how many motions each may take: every step may be tried again a few times, the policy is learned.
 WHOLE_RUNS = {"placing": 3 * 9, "stacking": 3 * 6}
+# A disk of placing with seed 10000.
+DISK, DISK_RADIUS_M, DISK_HEIGHT_M = Pose2D(x=0.4354, y=0.1635, theta=0.0), 0.028, 0.012
+VACUUM_PIN = 16
 # The way of a cancel and the braking of the arm, which takes 0.15 s.
 REST_AFTER_STOP_S = 0.4
 # The same after the watchdog's timeout.
@@ -269,6 +276,109 @@ def test_the_way_home_moves_only_by_an_approval_of_that_very_proposal(cell: Cell
     assert second.proposal_id != first.proposal_id
     assert cell.decide(second.proposal_id).outcome == StepResult.AT_HOME
     assert cell.decide(second.proposal_id).outcome == StepResult.REFUSED
+
+
+def look_at_disk(cell: Cell) -> Callable[[Heightmap], None]:
+    """A heightmap of now with the disk of the simulated cell that `DISK` names."""
+
+    def look(heightmap: Heightmap) -> None:
+        look_at(cell)(heightmap)
+        rows, cols = np.mgrid[: heightmap.rows, : heightmap.cols]
+        x_m = heightmap.origin.x + (cols + 0.5) * heightmap.pixel_size_m
+        y_m = heightmap.origin.y + (rows + 0.5) * heightmap.pixel_size_m
+        heightmap.height_m = np.where(np.hypot(x_m - DISK.x, y_m - DISK.y) < DISK_RADIUS_M, DISK_HEIGHT_M, 0.0).astype(np.float32).ravel()
+
+    return look
+
+
+def test_what_is_held_after_a_stop_is_put_down_where_it_was_picked(cell: Cell) -> None:
+    operator = cell.operator
+    pins: list[IOStates] = []
+    operator.node.create_subscription(IOStates, "io_and_status_controller/io_states", pins.append, STREAM)
+    client = operator.node.create_client(ProposeHome, "suction_executor/propose_put_down")
+
+    def holds() -> bool:
+        return bool(pins) and any(pin.pin == VACUUM_PIN and pin.state for pin in pins[-1].digital_in_states)
+
+    def propose_put_down() -> ProposeHome.Response:
+        operator.until(client.service_is_ready, "service propose_put_down", 30.0)
+        answer = client.call_async(ProposeHome.Request())
+        operator.until(answer.done, "answer of propose_put_down", 30.0)
+        return answer.result()
+
+    def stop_in_transfer() -> None:
+        def pick_the_disk(proposal: PickPlace) -> None:
+            proposal.pick = DISK
+
+        proposal = cell.propose(cell.observe(look_at_disk(cell)), pick_the_disk)
+        after = operator.count("step_result")
+        operator.confirm(proposal.id, StepConfirmation.APPROVE)
+        operator.until(holds, "vacuum", 30.0)
+        # Lifted, and on its way.
+        operator.spin(1.5)
+        operator.confirm(proposal.id, StepConfirmation.STOP)
+        stopped = operator.next("step_result", after, lambda result: result.proposal_id == proposal.id)
+        assert stopped.outcome == StepResult.STOPPED, stopped
+
+    operator.until(lambda: bool(pins), "io_states", 30.0)
+    nothing = propose_put_down()
+    assert not nothing.success and "holds nothing" in nothing.message
+    stop_in_transfer()
+    assert holds()
+    put_down = propose_put_down()
+    assert put_down.success and put_down.needs_approval, put_down.message
+    # The call moves nothing.
+    assert rest_after(cell, 1.0) == 0.0
+    assert holds()
+    ended = cell.decide(put_down.proposal_id)
+    assert ended.outcome == StepResult.AT_HOME and "put down where it was picked" in ended.reason, ended
+    assert not holds()
+    # It stands where it stood: it can be picked there again.
+    operator.spin(0.5)
+    stop_in_transfer()
+
+
+def test_letting_the_enabling_switch_go_stops_the_arm_and_nothing_moves_before_it_is_held(start, operator: Operator) -> None:
+    start("sim_workcell", *parameters("sim_workcell", seed=10000, hardware__enable_pin=3))
+    cell = Cell(operator)
+    start("suction_executor", *parameters("suction_executor", driver__enable_pin=3))
+    cell.wait_until_ready()
+    client = operator.node.create_client(SetParameters, "sim_workcell/set_parameters")
+
+    def enable(held: bool) -> None:
+        operator.until(client.service_is_ready, "sim_workcell", 30.0)
+        value = Parameter("hardware.enabled", Parameter.Type.BOOL, held).to_parameter_msg()
+        answer = client.call_async(SetParameters.Request(parameters=[value]))
+        operator.until(answer.done, "answer of sim_workcell", 30.0)
+        assert answer.result().results[0].successful, answer.result()
+
+    proposal = propose(cell)
+    after = operator.count("step_result")
+    operator.confirm(proposal.id, StepConfirmation.APPROVE)
+    wait_until_moving(cell)
+    enable(False)
+    stopped = operator.next("step_result", after, lambda result: result.proposal_id == proposal.id)
+    assert stopped.outcome == StepResult.STOPPED and "enabling input" in stopped.reason, stopped
+    assert rest_after(cell, 1.0) < 0.1
+    client_home = operator.node.create_client(ProposeHome, "suction_executor/propose_home")
+    operator.until(client_home.service_is_ready, "service propose_home", 30.0)
+    answer = client_home.call_async(ProposeHome.Request())
+    operator.until(answer.done, "answer of propose_home", 30.0)
+    assert not answer.result().success and "enable_pin" in answer.result().message, answer.result()
+
+
+def test_an_approval_counts_only_while_somebody_publishes_heightmaps(start, operator: Operator) -> None:
+    # Its age alone would let it move.
+    start("sim_workcell", *parameters("sim_workcell", seed=10000))
+    cell = Cell(operator)
+    start("suction_executor", *parameters("suction_executor", observation_max_age_s=60.0))
+    cell.wait_until_ready()
+    proposal = propose(cell)
+    cell.stop_publishing_heightmaps()
+    operator.spin(0.5)
+    refused = cell.decide(proposal.id)
+    assert refused.outcome == StepResult.REFUSED and "nobody publishes heightmaps" in refused.reason, refused
+    assert rest_after(cell, 1.0) == 0.0
 
 
 @pytest.mark.parametrize("problem", WHOLE_RUNS)

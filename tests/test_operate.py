@@ -74,6 +74,8 @@ def test_a_person_at_the_terminal_rejects_approves_stops_and_calls_the_arm_home(
     terminal.shows("carry it out?")
     terminal.says("y")
     terminal.shows("at home")
+    # The next view is from after that.
+    terminal.cell.operator.spin(0.5)
     # A step that was carried out is asked about, without a reward.
     proposal = terminal.offered()
     terminal.says("y")

@@ -386,11 +386,13 @@ def test_a_run_is_corrected_stopped_continued_and_handed_over_by_keyboard_alone(
     assert round(1000 * corrected.place.x) == typed
     expect(ada.button("Approve")).to_be_focused()
     ada.can("Approve")
-    # Stopped in mid-motion.
+    # Stopped in mid-motion, with the part held.
+    expect(ada.button("Put the part down")).to_be_hidden()
     slow_down(operator, 1.0)
     results = operator.count("step_result")
     keyboard.press("a")
     ada.reads("the arm moves")
+    ada.sees("holds something")
     keyboard.press("s")
     ada.reads("stopped")
     assert operator.next("step_result", results).outcome == StepResult.STOPPED
@@ -400,8 +402,14 @@ def test_a_run_is_corrected_stopped_continued_and_handed_over_by_keyboard_alone(
     assert said[1][1] == StepConfirmation.STOP
     keyboard.press("h")
     ada.can("Go home this way")
+    # It would carry the part home: it is put down instead, where it was picked, and nothing moves before that is approved.
+    keyboard.press("d")
+    ada.can("Put it down this way")
+    ada.finds_no_barrier()
+    assert len(decided()) == len(said)
     keyboard.press("g")
-    ada.sees("The arm is at home.")
+    ada.sees("what was held is put down where it was picked")
+    expect(ada.button("Put the part down")).to_be_hidden()
     keyboard.press("c")
     ada.reads("proposes")
     ada.can("Approve")

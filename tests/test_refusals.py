@@ -76,6 +76,10 @@ class Cell:
         self.newest_heightmap = heightmap
         self._publish(self._heightmaps, heightmap)
 
+    def stop_publishing_heightmaps(self) -> None:
+        """The camera fusion has gone."""
+        self.operator.node.destroy_publisher(self._heightmaps)
+
     def propose(self, heightmap: Heightmap, change: Callable[[PickPlace], None] = lambda _: None) -> PickPlace:
         """Publishes a proposal that is good unless changed."""
         self._id += 1
@@ -238,6 +242,18 @@ def test_an_approval_after_the_observation_changed_moves_nothing(cell: Cell) -> 
     cell.observe(put_a_box_there)
     cell.operator.spin(0.5)
     refused(cell, cell.decide(proposal.id), "changed")
+
+
+def test_a_way_through_something_moves_nothing(cell: Cell) -> None:
+    def wall(heightmap: Heightmap) -> None:
+        """0.3 m high and 19 mm thick, across the table between pick and place."""
+        heights_m = np.zeros((ROWS, COLS), dtype=np.float32)
+        heights_m[157:163] = 0.3
+        heightmap.height_m = heights_m.ravel()
+        # Simulated time stands still: a view of its own all the same.
+        heightmap.header.stamp.nanosec += 1_000
+
+    refused(cell, cell.decide(cell.propose(cell.observe(wall)).id), "the heightmap at (", "expected 0.01")
 
 
 def test_a_proposal_from_a_heightmap_that_nobody_saw_moves_nothing(cell: Cell) -> None:

@@ -47,7 +47,7 @@ const HOME_TIMEOUT: CallOptions = CallOptions {
 };
 /// A last decision takes so long to be sent.
 const LAST_WORD: Duration = Duration::from_millis(300);
-const HELP: &str = "at any time: [s]top, [h]ome, [q]uit";
+const HELP: &str = "at any time: [s]top, [h]ome, [p]ut down what is held, [q]uit";
 
 impl Operate {
     pub fn run(self) -> Result<()> {
@@ -159,9 +159,10 @@ struct Desk {
     confirmations: Publisher<StepConfirmation>,
     presence: Publisher<OperatorPresence>,
     home: Arc<ServiceClient<ProposeHome>>,
-    /// Answers to calls for the way home.
-    home_sender: mpsc::UnboundedSender<Result<ProposeHomeResponse, String>>,
-    homes: mpsc::UnboundedReceiver<Result<ProposeHomeResponse, String>>,
+    put_down: Arc<ServiceClient<ProposeHome>>,
+    /// Answers to calls for the way home, and whether what is held is to be put down before.
+    home_sender: mpsc::UnboundedSender<(bool, Result<ProposeHomeResponse, String>)>,
+    homes: mpsc::UnboundedReceiver<(bool, Result<ProposeHomeResponse, String>)>,
     operator: Operator,
     step_count: u32,
     due: Option<Due>,
@@ -191,6 +192,9 @@ impl Desk {
             confirmations: node.publisher("step_confirmation", Qos::Event)?,
             presence: node.publisher("operator_presence", Qos::Event)?,
             home: Arc::new(node.service_client(&format!("{}/propose_home", given.executor))?),
+            put_down: Arc::new(
+                node.service_client(&format!("{}/propose_put_down", given.executor))?,
+            ),
             home_sender,
             homes,
             operator: Operator::new(false),
@@ -224,8 +228,8 @@ impl Desk {
                 println!("refused: {}", refused.message);
                 None
             }
-            Some(answer) = self.homes.recv() => {
-                self.on_home(answer);
+            Some((puts_down, answer)) = self.homes.recv() => {
+                self.on_home(puts_down, answer);
                 None
             }
         };
@@ -299,15 +303,22 @@ impl Desk {
             result.outcome,
             StepOutcome::Fault | StepOutcome::Stopped | StepOutcome::NotHome
         ) {
-            println!("    the arm stands where it is: [h]ome proposes the way home");
+            println!(
+                "    the arm stands where it is: [h]ome proposes the way home, [p]ut down lowers what is held first"
+            );
         }
         self.operator.on_result(result)
     }
 
-    fn on_home(&mut self, answer: Result<ProposeHomeResponse, String>) {
+    fn on_home(&mut self, puts_down: bool, answer: Result<ProposeHomeResponse, String>) {
         match answer {
             Ok(answer) if answer.success && answer.needs_approval => {
-                println!("the way home, slowly, straight up first");
+                match puts_down {
+                    true => {
+                        println!("what is held is put down where it was picked, then the way home")
+                    }
+                    false => println!("the way home, slowly, straight up first"),
+                }
                 self.due = Some(Due::Home(ProposalId(answer.proposal_id)));
                 self.prompt();
             }
@@ -325,14 +336,20 @@ impl Desk {
             self.due = None;
             return self.decide(subject, OperatorDecision::Stop);
         }
-        if key == "h" {
-            let (client, sender) = (Arc::clone(&self.home), self.home_sender.clone());
+        if key == "h" || key == "p" {
+            let puts_down = key == "p";
+            let client = Arc::clone(if puts_down {
+                &self.put_down
+            } else {
+                &self.home
+            });
+            let sender = self.home_sender.clone();
             tokio::spawn(async move {
                 let answer = client
                     .call(&ProposeHomeRequest::default(), &HOME_TIMEOUT)
                     .await;
                 // The session may be over.
-                let _ = sender.send(answer.map_err(|error| error.to_string()));
+                let _ = sender.send((puts_down, answer.map_err(|error| error.to_string())));
             });
             return Ok(());
         }

@@ -39,11 +39,11 @@ pub use history::{History, RunCount, RunEvent};
 pub use library::{Entry, Libraries, Library};
 pub use listener::{Listener, Stream, TlsError, tls_acceptor};
 pub use preview::{InvalidPlan, Motion, Plan, Point, ScoreMaps};
-pub use refusal::{Refusal, advice};
+pub use refusal::Refusal;
 pub use run::{Decision, InvalidMessage, NodeReport, Phase, Pose, Run, View, Watch};
 pub use server::{Access, Page, router};
 pub use session::{Sessions, ViewerId};
-pub use state::{Command, Console, PolicyState, State};
+pub use state::{Command, Console, PolicyState, State, no_recovery};
 pub use tokio_rustls::TlsAcceptor;
 pub use training::Trainings;
 

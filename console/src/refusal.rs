@@ -24,7 +24,7 @@ impl Refusal {
 }
 
 /// What a person should do about a reason why a proposal that stands may not be carried out now: part of the reason, advice.
-const ADVICE: [(&str, &str); 13] = [
+const ADVICE: [(&str, &str); 16] = [
     (
         "no operator is present",
         "Keep the page of the operator open and in sight while the arm moves.",
@@ -53,6 +53,15 @@ const ADVICE: [(&str, &str); 13] = [
         "the way home: ",
         "Free the arm with the teach pendant, then call it home again.",
     ),
+    (
+        "putting down: ",
+        "Take away what stands in the way, or bring the arm home with what it holds.",
+    ),
+    (
+        "nobody saw where",
+        "Bring the arm home, and take the part from the gripper by hand.",
+    ),
+    ("holds nothing", "Bring the arm home."),
     (
         "on its way home",
         "Wait until the arm is at home, then approve again.",

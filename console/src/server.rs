@@ -132,6 +132,7 @@ pub fn router(page: Page, access: Access, end: CancellationToken) -> Router {
         .route("/decisions", post(decisions::decide))
         .route("/proposals", post(decisions::correct))
         .route("/home", post(decisions::home))
+        .route("/put_down", post(decisions::put_down))
         .route("/step", post(decisions::set_step))
         .route("/heightmaps/{which}", get(pictures::heightmap))
         .route("/cameras", get(pictures::list_cameras))

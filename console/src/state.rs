@@ -12,11 +12,13 @@ use std::time::{Duration, Instant};
 use bags::Demonstration;
 use serde::Serialize;
 use step_protocol::{
-    Confirmation, Observation, OperatorDecision, Proposal, ProposalId, StepOutcome, StepResult,
+    Confirmation, Observation, OperatorDecision, Proposal, ProposalId, Recovery, StepOutcome,
+    StepResult,
 };
 use tokio::sync::{mpsc, watch};
 
 use self::home::Home;
+pub use self::home::no_recovery;
 use self::learn::Repetition;
 use self::teach::Planning;
 use crate::history::RunEvent;
@@ -39,8 +41,8 @@ pub enum Command {
     Presence,
     /// Publish this proposal of the operator's.
     Propose(Box<Proposal>),
-    /// Have the executor propose the way home; for whom.
-    Home(String),
+    /// Have the executor propose the way home, or to put down what is held before; for whom.
+    Recover(Recovery, String),
     /// Have the oracle latch this step again; for whom.
     SetStep(u32, String),
     /// Have the oracle load the demonstration of this name in the library, at this path; for whom.
@@ -63,7 +65,7 @@ pub struct State {
     lesson: Option<Lesson>,
     /// The motion of the lesson that the executor has not planned yet.
     planning: Option<Planning>,
-    /// The way home that the executor has proposed.
+    /// The way home, or the putting down, that the executor has proposed.
     home: Option<Home>,
     /// The demonstration of the library that is repeated.
     repetition: Option<Repetition>,

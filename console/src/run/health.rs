@@ -90,6 +90,11 @@ impl Run {
         change(&mut self.robot);
     }
 
+    /// Whether the vacuum sensor feels an object.
+    pub fn holds(&self) -> bool {
+        self.robot.vacuum == Some(true)
+    }
+
     /// The age of all that should come regularly.
     pub(super) fn streams(&self, now: Duration) -> Vec<Stream> {
         let limit_s = self.watch.stale_after.as_secs_f64();

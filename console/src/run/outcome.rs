@@ -105,7 +105,11 @@ impl Run {
                 now,
             ),
             StepOutcome::AtHome => {
-                self.note("note", "The arm is at home.", "", now);
+                let text = match result.reason.as_str() {
+                    "" => "The arm is at home.".to_owned(),
+                    reason => sentence(&format!("the arm is at home: {reason}")),
+                };
+                self.note("note", text, "", now);
                 return;
             }
             StepOutcome::NotHome => {

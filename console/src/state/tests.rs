@@ -114,7 +114,7 @@ pub(crate) fn with_everything() -> Console {
             previous: "old.safetensors".into(),
         });
         state.begin_lesson(ada).unwrap();
-        state.on_home(ProposalId(9), true);
+        state.on_recovery(Recovery::Home, ProposalId(9), true);
         state.on_planned_motion(planned(9), now);
         state.lesson_saved();
     });
@@ -180,7 +180,11 @@ fn everybody_may_stop_and_only_the_operator_does_anything_else() {
     let (console, _, mut commands) = proposed();
     let bob = console.change(|state, now| state.sessions.join("Bob", "b".into(), now).unwrap());
     assert!(decide(&console, bob, 7, Decision::Approve).is_err());
-    assert!(console.change(|state, _| state.home(bob)).is_err());
+    assert!(
+        console
+            .change(|state, _| state.recover(bob, Recovery::Home))
+            .is_err()
+    );
     assert!(console.change(|state, _| state.set_step(bob, 1)).is_err());
     assert!(commands.try_recv().is_err());
     decide(&console, bob, 0, Decision::Stop).unwrap();
@@ -441,9 +445,12 @@ fn a_shown_step_is_changed_stopped_and_proposed_again_when_another_proposal_supe
 #[test]
 fn the_way_home_is_shown_and_moves_only_when_the_operator_approves_it() {
     let (console, ada, mut commands) = proposed();
-    console.change(|state, _| state.home(ada)).unwrap();
-    assert_eq!(commands.try_recv().unwrap(), Command::Home("Ada".into()));
-    console.change(|state, _| state.on_home(ProposalId(9), true));
+    console
+        .change(|state, _| state.recover(ada, Recovery::Home))
+        .unwrap();
+    let asked = Command::Recover(Recovery::Home, "Ada".into());
+    assert_eq!(commands.try_recv().unwrap(), asked);
+    console.change(|state, _| state.on_recovery(Recovery::Home, ProposalId(9), true));
     let refusal = decide(&console, ada, 9, Decision::Approve).unwrap_err();
     assert!(refusal.reason.contains("not been shown"), "{refusal:?}");
     console.change(|state, now| state.on_planned_motion(planned(9), now));
@@ -457,7 +464,7 @@ fn the_way_home_is_shown_and_moves_only_when_the_operator_approves_it() {
     assert_eq!(pending(), Some(7));
     decide(&console, ada, 9, Decision::Approve).unwrap_err();
     assert!(commands.try_recv().is_err());
-    console.change(|state, _| state.on_home(ProposalId(9), true));
+    console.change(|state, _| state.on_recovery(Recovery::Home, ProposalId(9), true));
     decide(&console, ada, 9, Decision::Approve).unwrap();
     let Ok(Command::Confirm(approval)) = commands.try_recv() else {
         panic!("expected an approval");
@@ -471,9 +478,39 @@ fn the_way_home_is_shown_and_moves_only_when_the_operator_approves_it() {
     console.change(|state, now| state.on_result(&at_home, now));
     assert_eq!(home(), None);
     // A stop withdraws it.
-    console.change(|state, _| state.on_home(ProposalId(10), true));
+    console.change(|state, _| state.on_recovery(Recovery::Home, ProposalId(10), true));
     decide(&console, bob, 0, Decision::Stop).unwrap();
     assert_eq!(home(), None);
+}
+
+#[test]
+fn what_is_held_is_put_down_only_when_the_operator_approves_it_and_only_while_something_is_held() {
+    let (console, ada, mut commands) = proposed();
+    let put_down = || console.change(|state, _| state.recover(ada, Recovery::PutDown));
+    let refusal = put_down().unwrap_err();
+    assert!(refusal.reason.contains("holds nothing"), "{refusal:?}");
+    console.change(|state, _| state.run.on_robot(|robot| robot.vacuum = Some(true)));
+    put_down().unwrap();
+    let asked = Command::Recover(Recovery::PutDown, "Ada".into());
+    assert_eq!(commands.try_recv().unwrap(), asked);
+    // Where it cannot be planned, there is nothing to approve.
+    console.change(|state, now| {
+        state.on_recovery(Recovery::PutDown, ProposalId(9), true);
+        state.on_planned_motion(unplanned(9, "putting down: something stands there"), now);
+    });
+    let refusal = decide(&console, ada, 9, Decision::Approve).unwrap_err();
+    assert!(refusal.reason.contains("cannot be put down"), "{refusal:?}");
+    assert!(commands.try_recv().is_err());
+    console.change(|state, now| {
+        state.on_recovery(Recovery::PutDown, ProposalId(10), true);
+        state.on_planned_motion(planned(10), now);
+    });
+    decide(&console, ada, 10, Decision::Approve).unwrap();
+    let Ok(Command::Confirm(approval)) = commands.try_recv() else {
+        panic!("expected an approval");
+    };
+    let expected = (ProposalId(10), OperatorDecision::Approve);
+    assert_eq!((approval.proposal_id, approval.decision), expected);
 }
 
 #[test]

@@ -3,11 +3,16 @@
 use crate::{Carried, Clearance, Collision, CollisionChecker, Contact, Scene, Terrain, lift_out};
 use heightmap::Heightmap;
 use nalgebra::{Point2, Vector3};
-use pick_place::{ExecuteError, Outcome, PickPlace, PrimitiveSettings, Robot, go_home};
+use pick_place::{
+    ExecuteError, Outcome, PickPlace, PrimitiveSettings, PutDown, Robot, Touchdown, execute_on,
+    go_home, put_down,
+};
 use ur5::{Arm, JointTrajectory, Joints};
 
 /// The cup may touch what is this near its axis (m), beside what it holds.
 const CUP_M: f64 = 0.02;
+/// A way is straight down when it leads no further aside (m).
+const STRAIGHT_M: f64 = 1e-3;
 /// The tool may touch what is so much higher than where it meets the surface: noise, and the rim of something hollow.
 const ROUGH_M: f64 = 0.015;
 
@@ -26,8 +31,20 @@ struct Rehearsal<'a> {
     clearance: Clearance,
 }
 
-/// Plans every motion of an action from where the arm is and checks it against cell and heightmap. `holds`: the gripper holds something already.
-/// Without a heightmap the table counts as empty.
+/// Where an action begins.
+#[derive(Clone, Copy, Debug)]
+pub struct Situation<'a> {
+    /// Where the joints are (rad).
+    pub joints: &'a Joints,
+    /// Whether the gripper holds something already.
+    pub holds: bool,
+    /// What stands on the table; without one it counts as empty.
+    pub heightmap: Option<&'a Heightmap>,
+    /// How the tip comes down, where the heights of the surfaces are known.
+    pub touchdown: Option<&'a Touchdown>,
+}
+
+/// Plans every motion of an action from where the arm is and checks it against cell and heightmap.
 ///
 /// # Errors
 /// What cannot be planned, or the first collision with the phase it is in.
@@ -36,10 +53,14 @@ pub fn rehearse(
     arm: &Arm,
     action: &PickPlace,
     settings: &PrimitiveSettings,
-    joints: &Joints,
-    holds: bool,
-    heightmap: Option<&Heightmap>,
+    situation: &Situation<'_>,
 ) -> Result<(Outcome, Clearance), ExecuteError<Box<Collision>>> {
+    let Situation {
+        joints,
+        holds,
+        heightmap,
+        touchdown,
+    } = *situation;
     let mut robot = Rehearsal {
         checker,
         arm,
@@ -56,7 +77,7 @@ pub fn rehearse(
     };
     // The arm may have been stopped on the table.
     robot.contact = Some(robot.contact_here());
-    let outcome = pick_place::execute(&mut robot, arm, action, settings, |_| ())?;
+    let outcome = execute_on(&mut robot, arm, action, settings, touchdown, |_| ())?;
     Ok((outcome, robot.clearance))
 }
 
@@ -72,24 +93,55 @@ pub fn rehearse_home(
     carried: Option<Carried>,
     heightmap: Option<&Heightmap>,
 ) -> Result<Clearance, ExecuteError<Box<Collision>>> {
-    let mut robot = Rehearsal {
-        checker,
-        arm,
-        joints: *joints,
-        holds: carried.is_some(),
-        heightmap: None,
-        terrain: heightmap.map(Terrain::new),
-        carried,
-        contact: None,
-        clearance: Clearance {
-            least_m: f64::INFINITY,
-            samples: 0,
-        },
-    };
-    // The arm may have been stopped on the table.
-    robot.contact = Some(robot.contact_here());
+    let mut robot = Rehearsal::carrying(checker, arm, joints, carried, heightmap);
     go_home(&mut robot, arm, settings)?;
     Ok(robot.clearance)
+}
+
+/// Plans how something that is held is put down, and the way home after that, like [`rehearse_home`].
+///
+/// # Errors
+/// What cannot be planned, or the first collision with the phase it is in.
+pub fn rehearse_put_down(
+    checker: &CollisionChecker,
+    arm: &Arm,
+    (what, settings): (&PutDown, &PrimitiveSettings),
+    joints: &Joints,
+    carried: Carried,
+    heightmap: &Heightmap,
+) -> Result<Clearance, ExecuteError<Box<Collision>>> {
+    let mut robot = Rehearsal::carrying(checker, arm, joints, Some(carried), Some(heightmap));
+    put_down(&mut robot, arm, what, settings)?;
+    Ok(robot.clearance)
+}
+
+impl<'a> Rehearsal<'a> {
+    /// Stands still and may hold something, on the table maybe.
+    fn carrying(
+        checker: &'a CollisionChecker,
+        arm: &'a Arm,
+        joints: &Joints,
+        carried: Option<Carried>,
+        heightmap: Option<&Heightmap>,
+    ) -> Self {
+        let mut robot = Self {
+            checker,
+            arm,
+            joints: *joints,
+            holds: carried.is_some(),
+            heightmap: None,
+            terrain: heightmap.map(Terrain::new),
+            carried,
+            contact: None,
+            clearance: Clearance {
+                least_m: f64::INFINITY,
+                samples: 0,
+            },
+        };
+        // The arm may have been stopped on the table.
+        robot.contact = Some(robot.contact_here());
+        robot
+    }
 }
 
 impl Rehearsal<'_> {
@@ -104,6 +156,19 @@ impl Rehearsal<'_> {
                 + self.checker.margins().obstacle_m,
             up_to_m: tip.z + ROUGH_M,
         }
+    }
+
+    /// Contact where a trajectory ends, with what stands there; only where it leads straight down.
+    fn contact_below(&self, trajectory: &JointTrajectory) -> Option<Contact> {
+        let tip = |joints| self.arm.tip(joints).translation.vector;
+        let (from, to) = (tip(&self.joints), tip(&trajectory.last().positions_rad));
+        let down = (from - to).xy().norm() < STRAIGHT_M && to.z < from.z;
+        let at = Point2::from(to.xy());
+        down.then(|| Contact {
+            center_m: at,
+            up_to_m: self.surface_m(at) + ROUGH_M,
+            ..self.contact_here()
+        })
     }
 
     fn check(
@@ -142,8 +207,9 @@ impl Robot for Rehearsal<'_> {
     }
 
     fn follow(&mut self, trajectory: &JointTrajectory) -> Result<bool, Box<Collision>> {
-        let contacts = self.contact.take().into_iter().collect();
-        self.check(trajectory, contacts)?;
+        let contact = self.contact.take();
+        let contact = contact.or_else(|| self.contact_below(trajectory));
+        self.check(trajectory, contact.into_iter().collect())?;
         Ok(true)
     }
 
@@ -195,6 +261,9 @@ impl Robot for Rehearsal<'_> {
             // As wide as what is held: what stands beside it is passed on the way straight up, and on that way only.
             self.contact = Some(self.contact_here());
         }
+        // The cup may have been pressed on.
+        let here = self.contact_here();
+        self.contact.get_or_insert(here);
         Ok(())
     }
 

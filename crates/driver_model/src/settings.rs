@@ -41,6 +41,10 @@ pub struct HardwareSettings {
     pub vacuum_release_s: f64,
     /// After how long what is held is lost (s); 0 for never.
     pub vacuum_leak_s: f64,
+    /// Digital input of an enabling switch; -1 for none.
+    pub enable_pin: i8,
+    /// Whether the enabling switch is held.
+    pub enabled: bool,
     /// What is wrong with the robot now.
     pub fault: Fault,
 }
@@ -63,6 +67,8 @@ impl Default for HardwareSettings {
             vacuum_build_s: 0.0,
             vacuum_release_s: 0.0,
             vacuum_leak_s: 0.0,
+            enable_pin: -1,
+            enabled: true,
             fault: Fault::None,
         }
     }

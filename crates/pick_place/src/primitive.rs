@@ -109,6 +109,9 @@ pub enum PrimitiveError {
     /// Suction already holds something.
     #[error("the gripper already holds something, expected it to be empty")]
     AlreadyHolding,
+    /// There is nothing to put down.
+    #[error("the gripper holds nothing, expected something to put down")]
+    HoldsNothing,
     /// The arm lagged behind with nothing held: something is in its way.
     #[error("{phase:?}: the arm lags behind although it holds nothing, something is in its way")]
     Blocked { phase: Phase },
@@ -175,6 +178,24 @@ enum Descent {
     Press,
 }
 
+impl PickPlace {
+    /// Poses of the tip at pick and place. The cup is round: only the turn from pick to place counts. Half of it before and half after keeps
+    /// wrist 3 away from its limits.
+    pub fn tips(&self) -> (Isometry2<f64>, Isometry2<f64>) {
+        let mut half_turn = 0.5 * self.pick.rotation.angle_to(&self.place.rotation);
+        // A full half-circle may go either way. Begun from this side, both are within the limits.
+        if half_turn < -FRAC_PI_2 + 1e-6 {
+            half_turn += PI;
+        }
+        let turned =
+            |pose: &Isometry2<f64>, yaw_rad| Isometry2::new(pose.translation.vector, yaw_rad);
+        (
+            turned(&self.pick, -half_turn),
+            turned(&self.place, half_turn),
+        )
+    }
+}
+
 impl<'a> Primitive<'a> {
     /// Checks settings and reach before anything moves. `joints` is where the arm is.
     ///
@@ -202,23 +223,17 @@ impl<'a> Primitive<'a> {
         };
         // The object may stand on others: as high as lift and clearance together could ask for.
         let wanted_m = settings.clearance_m + settings.lift_m;
-        let pick = ceiling("pick", &action.pick, wanted_m)?;
-        let place = ceiling("place", &action.place, wanted_m)?;
-        // The cup is round: only the turn from pick to place counts. Half of it before and half
-        // after keeps wrist 3 away from its limits.
-        let mut half_turn = 0.5 * action.pick.rotation.angle_to(&action.place.rotation);
-        // A full half-circle may go either way. Begun from this side, both are within the limits.
-        if half_turn < -FRAC_PI_2 + 1e-6 {
-            half_turn += PI;
-        }
-        let turned =
-            |pose: &Isometry2<f64>, yaw_rad| Isometry2::new(pose.translation.vector, yaw_rad);
+        let ceilings_m = (
+            ceiling("pick", &action.pick, wanted_m)?,
+            ceiling("place", &action.place, wanted_m)?,
+        );
+        let (pick, place) = action.tips();
         Ok(Self {
             arm,
-            pick: turned(&action.pick, -half_turn),
-            place: turned(&action.place, half_turn),
+            pick,
+            place,
             settings: *settings,
-            ceiling_m: (pick, place),
+            ceiling_m: ceilings_m,
             phase: Phase::Approach,
             approaching: false,
             joints: *joints,
@@ -534,7 +549,11 @@ impl<'a> Primitive<'a> {
 }
 
 /// The highest that the tip can go over a pose, at most `wanted_m`.
-fn ceiling_m(arm: &Arm, pose: &Isometry2<f64>, wanted_m: f64) -> Result<f64, Unreachable> {
+pub(crate) fn ceiling_m(
+    arm: &Arm,
+    pose: &Isometry2<f64>,
+    wanted_m: f64,
+) -> Result<f64, Unreachable> {
     arm.solve(&Arm::tip_down(pose, LOWEST_M), &arm.ready)?;
     let least = Arm::tip_down(pose, LEAST_RISE_M + STRETCH_MARGIN_M);
     arm.solve(&least, &arm.ready)?;

@@ -514,7 +514,11 @@ impl SimulatedCell {
             true => cell.is_holding(),
             false => self.vacuum.senses() && self.has_power(vacuum_pin),
         };
-        let inputs = (0..PINS).map(|pin| (pin, pin == vacuum_pin && senses));
+        let enable_pin = u8::try_from(self.hardware.enable_pin).ok();
+        let inputs = (0..PINS).map(|pin| {
+            let enabled = Some(pin) == enable_pin && self.hardware.enabled;
+            (pin, enabled || pin == vacuum_pin && senses)
+        });
         let mut outputs = self.outputs.clone();
         outputs.insert(suction_pin, self.valve);
         Pins {

@@ -22,6 +22,8 @@ const PROPOSALS: usize = 1024;
 const INVALID: usize = 64;
 /// Confirmations that wait for their proposal; more are refused at once.
 const WAITING: usize = 16;
+/// How long an approval waits until its motion has been rehearsed: less than a second, unless the machine is overloaded.
+const REHEARSAL_GRACE: Duration = Duration::from_secs(5);
 
 /// Which proposals move only when somebody approves them.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -182,8 +184,10 @@ pub enum Refusal {
         /// The proposal.
         id: ProposalId,
     },
-    /// The arm is not where the way home begins.
-    #[error("proposal {id}: the arm has moved since its way home was proposed: call for it again")]
+    /// The arm is not where the way home begins, or something else is held or seen.
+    #[error(
+        "proposal {id}: the arm has moved since its way home was proposed, or what is held or seen has changed: call for it again"
+    )]
     HomeFromElsewhere {
         /// The proposal.
         id: ProposalId,
@@ -249,6 +253,15 @@ pub enum Refusal {
         /// Where and how much.
         change: Change,
     },
+    /// Its motion was not rehearsed from where the arm is, on what is seen.
+    #[error(
+        "proposal {id}: its motion has not been checked for collisions within {:?}",
+        REHEARSAL_GRACE
+    )]
+    NotRehearsed {
+        /// The proposal.
+        id: ProposalId,
+    },
     /// It waited for its proposal when a stop came.
     #[error("proposal {id}: a stop came before it")]
     StopCame {
@@ -294,6 +307,8 @@ pub enum GateAction {
     Move(Box<Proposal>),
     /// Bring the arm home, by this proposal; [`ApprovalGate::finish`] has to follow.
     GoHome(ProposalId),
+    /// Put down what is held and bring the arm home, by this proposal; [`ApprovalGate::finish`] has to follow.
+    PutDown(ProposalId),
     /// Stop the motion under way.
     Cancel,
     /// Say this.
@@ -305,29 +320,48 @@ pub trait RobotState {
     /// Why the arm must not move now, if there is a reason.
     fn obstacle(&self) -> Option<String>;
 
-    /// Plans the whole motion from where the arm is.
+    /// Whether the whole motion can begin: it was rehearsed from where the arm is, on what is seen. Answers at once: a stop may be waiting.
     ///
     /// # Errors
-    /// Says what cannot be planned.
-    fn plan(&self, proposal: &Proposal) -> Result<(), String>;
+    /// Says what cannot be planned, or what would be hit; or that the motion has not been rehearsed.
+    fn check_motion(&self, proposal: &Proposal) -> Result<(), CannotBegin>;
 
-    /// Plans the way home from where the arm is. Returns where that is (rad).
+    /// The same for what brings the arm home. Returns where the arm is (rad).
     ///
     /// # Errors
-    /// Says what cannot be planned, or what would be hit.
-    fn plan_home(&self) -> Result<JointPositions, String>;
+    /// Says what cannot be planned, or what would be hit; or that the motion has not been rehearsed.
+    fn check_recovery(&self, recovery: Recovery) -> Result<JointPositions, CannotBegin>;
+}
+
+/// Why a motion cannot begin.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum CannotBegin {
+    /// For this reason.
+    Refused(String),
+    /// It was not rehearsed, or from elsewhere or on another view.
+    NotRehearsed,
+}
+
+/// What brings the arm home after a stop or a fault.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Recovery {
+    /// The way home; what is held stays held.
+    Home,
+    /// What is held is put down first.
+    PutDown,
 }
 
 /// Positions of the arm's joints (rad).
 pub type JointPositions = SVector<f64, 6>;
 
 /// The arm is where it was when no joint is further from there (rad): encoders have noise.
-const AT_REST_RAD: f64 = 1e-3;
+pub const AT_REST_RAD: f64 = 1e-3;
 
 /// A way home that can be approved.
 #[derive(Clone, Copy, Debug)]
 struct Home {
     id: ProposalId,
+    recovery: Recovery,
     /// Where it begins.
     from_rad: JointPositions,
 }
@@ -357,6 +391,7 @@ struct Newest {
 struct Waiting {
     id: ProposalId,
     decision: OperatorDecision,
+    since: Duration,
     until: Duration,
 }
 
@@ -552,7 +587,7 @@ impl ApprovalGate {
         robot: &impl RobotState,
         now: Duration,
     ) -> Vec<GateAction> {
-        self.confirm(id, decision, robot, now, None)
+        self.confirm(id, decision, robot, now, now)
     }
 
     /// Answers the confirmations that wait, where what they wait for has arrived or their time is up.
@@ -562,9 +597,10 @@ impl ApprovalGate {
             let Waiting {
                 id,
                 decision,
-                until,
+                since,
+                ..
             } = waiting;
-            self.confirm(id, decision, robot, now, Some(until))
+            self.confirm(id, decision, robot, now, since)
         };
         waiting.into_iter().flat_map(again).collect()
     }
@@ -574,14 +610,14 @@ impl ApprovalGate {
         self.waiting.iter().map(|waiting| waiting.until).min()
     }
 
-    /// `until`: how long it may wait, where it has waited already.
+    /// `since`: when it arrived.
     fn confirm(
         &mut self,
         id: ProposalId,
         decision: OperatorDecision,
         robot: &impl RobotState,
         now: Duration,
-        until: Option<Duration>,
+        since: Duration,
     ) -> Vec<GateAction> {
         let mut actions = Vec::new();
         if decision == OperatorDecision::Stop {
@@ -604,13 +640,18 @@ impl ApprovalGate {
             Verdict::Report(outcome, reason) => actions.push(self.report(id, outcome, reason)),
             Verdict::Refuse(refusal) => actions.push(self.refuse(id, &refusal)),
             Verdict::Wait(refusal) => {
-                let until = until.unwrap_or(now + self.rules.confirmation_grace);
+                let grace = match refusal {
+                    Refusal::NotRehearsed { .. } => REHEARSAL_GRACE,
+                    _ => self.rules.confirmation_grace,
+                };
+                let until = since + grace;
                 if now >= until || self.waiting.len() >= WAITING {
                     actions.push(self.refuse(id, &refusal));
                 } else {
                     self.waiting.push_back(Waiting {
                         id,
                         decision,
+                        since,
                         until,
                     });
                 }
@@ -671,6 +712,13 @@ impl ApprovalGate {
         }
     }
 
+    /// The proposal that can be approved, the way home apart.
+    pub fn pending(&self) -> Option<&Proposal> {
+        let newest = self.newest.as_ref()?;
+        let id = newest.proposal.id;
+        self.check_pending(id).ok().map(|()| &newest.proposal)
+    }
+
     /// Takes a proposal back that nobody has approved yet.
     pub fn withdraw(&mut self, id: ProposalId) {
         if self.status(id) == Some(ProposalStatus::Pending) {
@@ -678,37 +726,44 @@ impl ApprovalGate {
         }
     }
 
-    /// Proposes the way home from where the arm is; `id` is for a new proposal. Returns the id of the one that can be approved now: the
-    /// one before where the arm has not moved since.
+    /// Proposes the way home from where the arm is, maybe after what is held is put down; `id` is for a new proposal. Returns the id of the one
+    /// that can be approved now: the one before where the arm has not moved since.
     ///
     /// # Errors
-    /// Says why there is no way home now.
+    /// Says why there is no way home now, or that it has to be rehearsed first.
     pub fn propose_home(
         &mut self,
         id: ProposalId,
+        recovery: Recovery,
         robot: &impl RobotState,
-    ) -> Result<ProposalId, String> {
+    ) -> Result<ProposalId, CannotBegin> {
+        let refuse = |reason| Err(CannotBegin::Refused(reason));
         if let Some(id) = self.moving {
-            return Err(format!("proposal {id} is being carried out"));
+            return refuse(format!("proposal {id} is being carried out"));
         }
         if self.homing.is_some() {
-            return Err("the arm is on its way home".to_owned());
+            return refuse("the arm is on its way home".to_owned());
         }
         if let Some(obstacle) = robot.obstacle() {
-            return Err(obstacle);
+            return refuse(obstacle);
         }
-        let from_rad = robot.plan_home()?;
+        let from_rad = robot.check_recovery(recovery)?;
         if let Some(home) = &self.home
+            && home.recovery == recovery
             && home.is_from(&from_rad)
         {
             return Ok(home.id);
         }
         if self.status(id).is_some() {
-            return Err(format!("proposal {id} is another one"));
+            return refuse(format!("proposal {id} is another one"));
         }
         self.close_home(ProposalStatus::Superseded);
         self.remember(id);
-        self.home = Some(Home { id, from_rad });
+        self.home = Some(Home {
+            id,
+            recovery,
+            from_rad,
+        });
         Ok(id)
     }
 
@@ -799,8 +854,15 @@ impl ApprovalGate {
         if let Err(verdict) = self.check_unchanged(newest) {
             return verdict;
         }
-        if let Err(reason) = robot.plan(proposal) {
-            return Verdict::Refuse(Refusal::Robot { id, reason });
+        match robot.check_motion(proposal) {
+            Ok(()) => {}
+            Err(CannotBegin::Refused(reason)) => {
+                return Verdict::Refuse(Refusal::Robot { id, reason });
+            }
+            Err(CannotBegin::NotRehearsed) if planted(Mutation::MovesUnrehearsed) => {}
+            Err(CannotBegin::NotRehearsed) => {
+                return Verdict::Wait(Refusal::NotRehearsed { id });
+            }
         }
         let proposal = Box::new(proposal.clone());
         if !planted(Mutation::HomeSurvivesMotion) {
@@ -819,18 +881,23 @@ impl ApprovalGate {
         if let Some(reason) = robot.obstacle() {
             return Verdict::Refuse(Refusal::Robot { id, reason });
         }
-        match robot.plan_home() {
+        match robot.check_recovery(home.recovery) {
             Ok(from_rad) if home.is_from(&from_rad) => {}
-            Ok(_) => {
+            Ok(_) | Err(CannotBegin::NotRehearsed) => {
                 self.close_home(ProposalStatus::Withdrawn);
                 return Verdict::Refuse(Refusal::HomeFromElsewhere { id });
             }
-            Err(reason) => return Verdict::Refuse(Refusal::Robot { id, reason }),
+            Err(CannotBegin::Refused(reason)) => {
+                return Verdict::Refuse(Refusal::Robot { id, reason });
+            }
         }
         self.home = None;
         self.set_status(id, ProposalStatus::Moving);
         self.homing = Some(id);
-        Verdict::Act(GateAction::GoHome(id))
+        Verdict::Act(match home.recovery {
+            Recovery::Home => GateAction::GoHome(id),
+            Recovery::PutDown => GateAction::PutDown(id),
+        })
     }
 
     fn reject(&mut self, id: ProposalId) -> Verdict {

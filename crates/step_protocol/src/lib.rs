@@ -6,9 +6,11 @@
 
 mod gate;
 mod goals;
+mod motion;
 mod mutation;
 mod operator;
 mod planner;
+mod presence;
 mod tracker;
 mod types;
 
@@ -16,15 +18,17 @@ mod types;
 mod tests;
 
 pub use gate::{
-    ApprovalGate, GateAction, GateRules, InvalidProposal, JointPositions, Proposed, Refusal,
-    Report, RequireApproval, RobotState,
+    AT_REST_RAD, ApprovalGate, CannotBegin, GateAction, GateRules, InvalidProposal, JointPositions,
+    Proposed, Recovery, Refusal, Report, RequireApproval, RobotState,
 };
 pub use goals::{
     FAILED_PICK_RADIUS_M, FailedPicks, GoalSequence, Judgement, NoGoals, ReachedGoals, ShownStep,
     goal_steps, goals_of,
 };
+pub use motion::{MotionCause, MotionEnd, MotionWord, StopCause};
 pub use operator::{Operator, Question};
 pub use planner::{Job, PlannerRules, Prediction, ProposalPlanner};
+pub use presence::Presence;
 pub use tracker::{
     Capture, CaptureError, Change, ConfirmationRefusal, GoalTracker, NoSuchStep, RefusalKind,
     StepJudge,

@@ -15,6 +15,8 @@ pub(crate) enum Mutation {
     AnyApprovalMovesNewest,
     /// An approval while the arm moves is accepted.
     MovesWhileMoving,
+    /// A motion begins that was not rehearsed.
+    MovesUnrehearsed,
     /// A call for the way home moves the arm.
     HomeMovesUnasked,
     /// The proposed way home can still be approved after a stop.
@@ -40,13 +42,14 @@ pub(crate) enum Mutation {
 impl Mutation {
     /// All of them.
     #[cfg(test)]
-    pub(crate) const ALL: [Self; 16] = [
+    pub(crate) const ALL: [Self; 17] = [
         Self::ApprovalMovesTwice,
         Self::SupersededStaysPending,
         Self::WaitingSurvivesStop,
         Self::WaitingSurvivesDeactivation,
         Self::AnyApprovalMovesNewest,
         Self::MovesWhileMoving,
+        Self::MovesUnrehearsed,
         Self::HomeMovesUnasked,
         Self::HomeSurvivesStop,
         Self::HomeSurvivesMotion,

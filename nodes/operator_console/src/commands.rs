@@ -6,7 +6,7 @@ use std::time::Duration;
 
 use anyhow::Context as _;
 use bags::Demonstration;
-use console::{Command, Console, Page, PolicyState};
+use console::{Command, Console, Page, PolicyState, Refusal};
 use heightmap::Heightmap;
 use msgs::convert;
 use msgs::sctn_msgs::{
@@ -15,15 +15,15 @@ use msgs::sctn_msgs::{
     StepConfirmation,
 };
 use node_kit::{CallOptions, Node, Publisher, Qos, ServiceClient};
-use step_protocol::{Confirmation, Proposal, ProposalId};
+use step_protocol::{Confirmation, Proposal, ProposalId, Recovery};
 use tracing::{error, info, warn};
 
 use crate::{OperatorConsoleParameters, PRESENCE_PERIOD};
 
 const CHOOSE_ANOTHER: &str =
     "Choose another demonstration, or look whether the goal oracle is at work.";
-/// How long the plan of the way home may take.
-const HOME_TIMEOUT: CallOptions = CallOptions {
+/// How long the plan of a recovery may take.
+const RECOVERY_TIMEOUT: CallOptions = CallOptions {
     attempts: 1,
     timeout: Duration::from_secs(60),
 };
@@ -35,6 +35,7 @@ pub struct Commands {
     proposals: Publisher<PickPlace>,
     presence: Publisher<OperatorPresence>,
     home: Arc<ServiceClient<ProposeHome>>,
+    put_down: Arc<ServiceClient<ProposeHome>>,
     set_step: Arc<ServiceClient<SetStep>>,
     load: Arc<ServiceClient<LoadDemonstration>>,
     load_checkpoint: Arc<ServiceClient<LoadCheckpoint>>,
@@ -58,6 +59,7 @@ impl Commands {
             proposals: node.publisher("pick_place", Qos::Latched)?,
             presence: node.publisher("operator_presence", Qos::Event)?,
             home: Arc::new(node.service_client(&format!("{executor}/propose_home"))?),
+            put_down: Arc::new(node.service_client(&format!("{executor}/propose_put_down"))?),
             set_step: Arc::new(node.service_client(&format!("{goal_oracle}/set_step"))?),
             load: Arc::new(node.service_client(&format!("{goal_oracle}/load_demonstration"))?),
             load_checkpoint: Arc::new(node.service_client(&format!("{policy}/load_checkpoint"))?),
@@ -87,7 +89,7 @@ impl Commands {
             Command::Confirm(confirmation) => self.confirm(node, &confirmation),
             Command::Presence => self.publish_presence(node),
             Command::Propose(proposal) => self.propose(&proposal),
-            Command::Home(name) => self.ask_for_home(node, &name),
+            Command::Recover(recovery, name) => self.ask_for_recovery(node, recovery, &name),
             Command::SetStep(step, name) => self.set_step(node, step, &name),
             Command::Load(demonstration, path, name) => {
                 self.load(node, demonstration, path, &name);
@@ -142,25 +144,28 @@ impl Commands {
         }
     }
 
-    fn ask_for_home(&self, node: &Node, name: &str) {
-        info!("`{name}` asks for the way home");
+    fn ask_for_recovery(&self, node: &Node, recovery: Recovery, name: &str) {
+        let (client, what) = match recovery {
+            Recovery::Home => (&self.home, "the way home"),
+            Recovery::PutDown => (&self.put_down, "putting down what is held"),
+        };
+        info!("`{name}` asks for {what}");
         self.publish_presence(node);
-        let (client, console) = (Arc::clone(&self.home), self.console());
+        let (client, console) = (Arc::clone(client), self.console());
         node.spawn(async move {
             // The executor has to hear that the operator is present before the call, also where they have just taken control.
             tokio::time::sleep(PRESENCE_PERIOD).await;
             let request = ProposeHomeRequest::default();
-            let reason = match client.call(&request, &HOME_TIMEOUT).await {
+            let reason = match client.call(&request, &RECOVERY_TIMEOUT).await {
                 Ok(answer) if answer.success => {
                     let (id, asks) = (ProposalId(answer.proposal_id), answer.needs_approval);
-                    return console.change(|state, _| state.on_home(id, asks));
+                    return console.change(|state, _| state.on_recovery(recovery, id, asks));
                 }
                 Ok(answer) => answer.message,
                 Err(error) => error.to_string(),
             };
-            let advice = console::advice(&reason);
-            let text = format!("There is no way home: {reason}");
-            console.change(|state, now| state.run.note("refusal", text, advice, now));
+            let Refusal { reason, advice } = console::no_recovery(recovery, &reason);
+            console.change(|state, now| state.run.note("refusal", reason, advice, now));
         });
     }
 

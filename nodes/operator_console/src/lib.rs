@@ -231,10 +231,15 @@ impl Active for ConsoleNode {
                 message = pins.recv() => {
                     let suction = level(&message.digital_out_states, self.parameters.suction_pin);
                     let vacuum = level(&message.digital_in_states, self.parameters.vacuum_pin);
-                    console.change_quietly(|state, _| state.run.on_robot(|robot| {
+                    let change = |state: &mut console::State, _| state.run.on_robot(|robot| {
                         robot.suction = suction;
                         robot.vacuum = vacuum;
-                    }));
+                    });
+                    // What is held can be put down: viewers are told at once.
+                    match console.read(|state, _| state.run.holds()) == (vacuum == Some(true)) {
+                        true => console.change_quietly(change),
+                        false => console.change(change),
+                    }
                 }
                 message = robot_modes.recv() => {
                     console.change(|state, _| state.run.on_robot(|robot| robot.robot_mode = Some(message.mode)));

@@ -109,6 +109,7 @@ impl Parameters for SimWorkcellParameters {
         ("hardware.vacuum_build_s", DELAY),
         ("hardware.vacuum_release_s", DELAY),
         ("hardware.vacuum_leak_s", Range::NOT_NEGATIVE),
+        ("hardware.enable_pin", Range::Integer(-1, 17)),
     ];
     const CHANGEABLE: &'static [&'static str] = &[
         "real_time_factor",
@@ -120,6 +121,7 @@ impl Parameters for SimWorkcellParameters {
         "hardware.encoder_noise_rad",
         "hardware.speed_scaling",
         "hardware.vacuum_leak_s",
+        "hardware.enabled",
         "hardware.fault",
     ];
 }

@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use node_kit::{Parameters, Range};
-use pick_place::PrimitiveSettings;
+use pick_place::{ContactSettings, PrimitiveSettings};
 use serde::{Deserialize, Serialize};
 use step_protocol::RequireApproval;
 use ur_driver::DriverParameters;
@@ -36,12 +36,12 @@ pub struct SuctionExecutorParameters {
     pub observation_max_age_s: f64,
     /// Whether heightmaps count only where the arm was at home and at rest when they were taken.
     pub observation_needs_home: bool,
-    /// Distance that the way home keeps from the cell and from what was seen (m).
+    /// Distance that the arm keeps from the cell and from what was seen (m).
     pub collision_margin_m: f64,
     /// Wall seconds that a confirmation waits for its proposal and heightmap.
     pub confirmation_grace_s: f64,
     /// How the tip comes down.
-    pub contact: Contact,
+    pub contact: ContactSettings,
     /// The driver and its wiring.
     pub driver: DriverParameters,
 }
@@ -72,31 +72,6 @@ pub struct Limits {
     pub acceleration_m_s2: f64,
 }
 
-/// How the tip comes down on surfaces that were seen.
-#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
-#[serde(default, deny_unknown_fields)]
-pub struct Contact {
-    /// So far above the surface the tip slows down (m); 0: descents are fast to their end.
-    pub slow_from_m: f64,
-    /// Speed of the tip from there on (m/s).
-    pub slow_m_s: f64,
-    /// Contact higher than expected by more is a fault, and a descent ends so far below the surface (m).
-    pub window_m: f64,
-    /// The cup is pressed on by so much after contact (m).
-    pub press_m: f64,
-}
-
-impl Default for Contact {
-    fn default() -> Self {
-        Self {
-            slow_from_m: 0.0,
-            slow_m_s: 0.05,
-            window_m: 0.015,
-            press_m: 0.0,
-        }
-    }
-}
-
 impl Default for SuctionExecutorParameters {
     fn default() -> Self {
         Self {
@@ -114,7 +89,7 @@ impl Default for SuctionExecutorParameters {
             observation_needs_home: false,
             collision_margin_m: 0.01,
             confirmation_grace_s: 0.5,
-            contact: Contact::default(),
+            contact: ContactSettings::default(),
             driver: DriverParameters::default(),
         }
     }
@@ -185,6 +160,7 @@ impl Parameters for SuctionExecutorParameters {
         ("contact.press_m", Range::Float(0.0, 0.01)),
         ("driver.suction_pin", PIN),
         ("driver.vacuum_pin", PIN),
+        ("driver.enable_pin", Range::Integer(-1, 17)),
         ("driver.status_max_age_s", TIME),
         ("driver.reading_timeout_s", TIME),
         ("driver.rest_speed_rad_s", Range::POSITIVE),

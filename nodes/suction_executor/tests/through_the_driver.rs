@@ -381,9 +381,9 @@ async fn episode(problem: &str) -> Environment {
         let action = match environment.demonstrate() {
             _ if environment.is_done() => break,
             None => break,
-            // Nothing to pick there: what fails, fails alike.
+            // Nothing to pick there, and nothing in the way: what fails, fails alike.
             Some(_) if id == 3 => PickPlace {
-                pick: Isometry2::new(Vector2::new(0.3, -0.45), 0.0),
+                pick: Isometry2::new(Vector2::new(0.3, 0.3), 0.0),
                 place: Isometry2::new(Vector2::new(0.6, 0.45), 1.0),
             },
             Some(action) => action,

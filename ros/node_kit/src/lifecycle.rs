@@ -33,7 +33,7 @@ use crate::{
 };
 
 /// How long a node that waits for the end of its work may take to tidy up.
-const GRACE: Duration = Duration::from_secs(2);
+const GRACE: Duration = Duration::from_secs(4);
 
 /// Requests that wait for the transition under way.
 const WAITING_REQUESTS: usize = 8;

@@ -26,13 +26,13 @@ use self::status::DriverStatus;
 use self::streams::follow_status;
 
 pub use self::heartbeat::{ActivateError, ActiveExecutor, Heartbeat};
-pub use self::parameters::{ContactSign, DriverParameters};
+pub use self::parameters::DriverParameters;
 pub use self::robot::DriverRobot;
 
 /// Why the robot does not go on. Suction stays as it is: holding is safer than dropping.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum DriverError {
-    /// The motion was stopped; whoever stopped it knows why.
+    /// The motion was stopped: whoever stopped it knows why; or the enabling input was low.
     #[error("stopped")]
     Stopped,
     /// The driver failed, stopped by itself, or was lost.
@@ -105,6 +105,11 @@ impl DriverClient {
             Readiness::Refused(reason) => Some(reason.clone()),
             Readiness::Ready | Readiness::Unchecked(_) => None,
         }
+    }
+
+    /// Whether the enabling input is low, or has been since a time.
+    pub fn is_disabled_since(&self, since: Duration) -> bool {
+        self.status.borrow().is_disabled_since(since)
     }
 
     /// Why the arm must not move now, if there is a reason.

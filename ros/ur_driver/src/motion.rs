@@ -8,14 +8,14 @@ use std::time::{Duration, Instant};
 
 use msgs::Action;
 use node_kit::{ActionClient, CallError, CallOptions, GoalStatus, SentGoal};
+use pick_place::ContactSign;
 use tokio::sync::oneshot;
 use tokio::time::{MissedTickBehavior, interval, sleep, timeout};
 use tokio_util::sync::CancellationToken;
 use tracing::{debug, info, warn};
 
 use crate::planted::{Planted, is_planted};
-use crate::{ContactSign, DriverParameters};
-use crate::{DriverClient, DriverError};
+use crate::{DriverClient, DriverError, DriverParameters};
 
 /// How often a motion is looked after.
 pub(crate) const WATCH_PERIOD: Duration = Duration::from_millis(20);
@@ -186,12 +186,16 @@ impl DriverClient {
         let margin = Duration::from_secs_f64(motion_time_margin_s);
         let limit = planned.mul_f64(motion_time_factor) + margin;
         let begin_ns = self.clock.now_ns();
+        let since = self.origin.elapsed();
         let mut ticks = interval(WATCH_PERIOD);
         ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
         loop {
             tokio::select! {
                 () = stop.cancelled() => return DriverError::Stopped,
                 _ = ticks.tick() => {}
+            }
+            if self.is_disabled_since(since) {
+                return DriverError::Stopped;
             }
             if let Some(obstacle) = self.obstacle() {
                 return DriverError::Fault(obstacle);

@@ -5,10 +5,11 @@ use std::time::Duration;
 use msgs::controller_manager_msgs::{ControllerState, ListControllers, ListControllersRequest};
 use msgs::ur_msgs::{GetRobotSoftwareVersion, GetRobotSoftwareVersionRequest, ToolDataMsg};
 use node_kit::{CallOptions, Node, NodeError, Qos, ServiceClient, Subscription};
+use pick_place::ContactSign;
 use tokio::sync::watch;
 use tracing::{info, warn};
 
-use crate::{ContactSign, DriverParameters};
+use crate::DriverParameters;
 
 /// Detects contact for the action that moves until contact.
 const TOOL_CONTACT: &str = "tool_contact_controller";

@@ -8,14 +8,13 @@ use msgs::ur_msgs::{
     FollowJointTrajectoryUntilGoal, FollowJointTrajectoryUntilResult, SetIORequest,
 };
 use node_kit::GoalStatus;
-use pick_place::Robot;
+use pick_place::{ContactSign, Robot};
 use tokio::runtime::Handle;
 use tokio::time::{MissedTickBehavior, interval, timeout};
 use tokio_util::sync::CancellationToken;
 use tracing::debug;
 use ur5::{JointTrajectory, Joints};
 
-use crate::ContactSign;
 use crate::motion::WATCH_PERIOD;
 use crate::readiness::Readiness;
 use crate::status::DriverStatus;
@@ -49,7 +48,7 @@ impl DriverRobot {
 
     /// Refuses to go on where it must not.
     fn check(&self) -> Result<(), DriverError> {
-        if self.stop.is_cancelled() {
+        if self.stop.is_cancelled() || self.client.is_disabled_since(self.begun) {
             return Err(DriverError::Stopped);
         }
         if let Some(obstacle) = self.client.obstacle() {

@@ -18,6 +18,8 @@ pub struct Pins {
     pub suction: bool,
     /// Input of the vacuum sensor.
     pub vacuum: bool,
+    /// Whether the enabling input is low; false where there is none.
+    pub disabled: bool,
 }
 
 /// A state that the driver streams.
@@ -58,6 +60,8 @@ pub struct DriverStatus {
     pub at_home: AtHome,
     /// `io_states`
     pub pins: Option<Newest<Pins>>,
+    /// Arrival of the newest state of the pins in which the enabling input was low.
+    pub disabled_at: Option<Duration>,
 }
 
 /// A run of joint readings at the same place.
@@ -125,6 +129,9 @@ impl DriverStatus {
 
     /// Takes the next state of the pins.
     pub fn read_pins(&mut self, pins: Pins, at: Duration) {
+        if pins.disabled {
+            self.disabled_at = Some(at);
+        }
         self.pins = Some(Newest::next(self.pins.as_ref(), pins, at));
     }
 }
@@ -175,7 +182,14 @@ impl DriverStatus {
                 ));
             }
         }
-        None
+        let disabled = self.pins.is_some_and(|pins| pins.value.disabled);
+        disabled.then(|| "the enabling input is low (driver.enable_pin)".into())
+    }
+
+    /// Whether the enabling input is low, or has been since a time.
+    pub fn is_disabled_since(&self, since: Duration) -> bool {
+        self.pins.is_some_and(|pins| pins.value.disabled)
+            || self.disabled_at.is_some_and(|at| at >= since)
     }
 }
 
@@ -221,6 +235,7 @@ mod tests {
             still: None,
             interrupted_at: None,
             at_home: AtHome::default(),
+            disabled_at: None,
             pins: Some(Newest {
                 value: Pins::default(),
                 at: now,
@@ -321,6 +336,19 @@ mod tests {
             let reason = status.obstacle(now, AGE).unwrap();
             assert!(reason.contains(expected), "{reason}");
         }
+        let mut disabled = ready.clone();
+        let pins = |disabled| Pins {
+            disabled,
+            ..Pins::default()
+        };
+        disabled.read_pins(pins(true), now);
+        let reason = disabled.obstacle(now, AGE).unwrap();
+        assert!(reason.contains("enable_pin"), "{reason}");
+        // What was low for a moment is remembered.
+        disabled.read_pins(pins(false), now + AGE);
+        assert_eq!(disabled.obstacle(now, AGE), None);
+        assert!(disabled.is_disabled_since(now));
+        assert!(!disabled.is_disabled_since(now + AGE));
         let reduced = DriverStatus {
             safety_mode: Some(REDUCED),
             ..ready

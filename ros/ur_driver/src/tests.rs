@@ -21,14 +21,26 @@ const PATIENCE: Duration = Duration::from_secs(30);
 struct Bench {
     sim: Context,
     own: Context,
-    node: Node,
+    /// Lives as long as the bench.
+    _node: Node,
     client: Arc<DriverClient>,
+    /// Sets parameters of the simulated driver.
+    parameters: ServiceClient<SetParameters>,
     cell: WorkCell,
 }
 
 impl Bench {
     /// `hardware`: parameters of the simulated driver.
     async fn start(hardware: &[(&str, &str)], driver: DriverParameters) -> Self {
+        let bench = Self::start_disabled(hardware, driver).await;
+        bench
+            .until("a ready driver", |bench| bench.client.obstacle().is_none())
+            .await;
+        bench
+    }
+
+    /// The same where the driver may not get ready; its streams are there.
+    async fn start_disabled(hardware: &[(&str, &str)], driver: DriverParameters) -> Self {
         if let Ok(level) = std::env::var("TEST_LOG_LEVEL") {
             // Once for all tests of the process.
             let _ = node_kit::logging::init(&[level]);
@@ -54,15 +66,20 @@ impl Bench {
         let arguments = RosArguments::parse(line).unwrap().0;
         sim.start("sim_workcell", &arguments, sim_workcell::configure)
             .unwrap();
+        let parameters = node.service_client("sim_workcell/set_parameters").unwrap();
         let bench = Self {
             sim,
             own,
-            node,
+            _node: node,
             client: Arc::new(client),
+            parameters,
             cell,
         };
         bench
-            .until("a ready driver", |bench| bench.client.obstacle().is_none())
+            .until("streams of the driver", |bench| {
+                let status = bench.client.status.borrow();
+                status.joints.is_some() && status.pins.is_some()
+            })
             .await;
         bench
     }
@@ -131,24 +148,39 @@ impl Bench {
         furthest
     }
 
-    /// Sets a parameter of the simulated driver.
+    /// Sets what is wrong with the robot.
     async fn set_fault(&self, fault: &str) {
-        let client = self
-            .node
-            .service_client::<SetParameters>("sim_workcell/set_parameters")
-            .unwrap();
-        client.wait_for_server(PATIENCE).await.unwrap();
+        let value = ParameterValue {
+            r#type: ParameterType::PARAMETER_STRING,
+            string_value: fault.into(),
+            ..Default::default()
+        };
+        self.set("hardware.fault", value).await;
+    }
+
+    /// Holds the enabling switch or lets it go.
+    async fn enable(&self, enabled: bool) {
+        let value = ParameterValue {
+            r#type: ParameterType::PARAMETER_BOOL,
+            bool_value: enabled,
+            ..Default::default()
+        };
+        self.set("hardware.enabled", value).await;
+    }
+
+    /// Sets a parameter of the simulated driver.
+    async fn set(&self, name: &str, value: ParameterValue) {
+        self.parameters.wait_for_server(PATIENCE).await.unwrap();
         let request = SetParametersRequest {
             parameters: vec![Parameter {
-                name: "hardware.fault".into(),
-                value: ParameterValue {
-                    r#type: ParameterType::PARAMETER_STRING,
-                    string_value: fault.into(),
-                    ..Default::default()
-                },
+                name: name.into(),
+                value,
             }],
         };
-        let answer = client.call(&request, &CallOptions::default()).await;
+        let answer = self
+            .parameters
+            .call(&request, &CallOptions::default())
+            .await;
         assert!(answer.unwrap().results[0].successful);
     }
 }
@@ -473,4 +505,35 @@ async fn suction_waits_for_the_vacuum_and_the_release_is_verified() {
     });
     let (took, holds) = gripped.await.unwrap();
     assert!(took >= Duration::from_secs(1) && !holds, "{took:?} {holds}");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn nothing_moves_without_the_enabling_switch_and_letting_it_go_stops_a_motion() {
+    let driver = DriverParameters {
+        enable_pin: 3,
+        ..DriverParameters::default()
+    };
+    let hardware = [
+        ("enable_pin", "3"),
+        ("enabled", "false"),
+        ("braking_time_s", "0.1"),
+    ];
+    let bench = Bench::start_disabled(&hardware, driver).await;
+    let turn = bench.turn(2.0);
+    let same = turn.clone();
+    let moved = bench.work(&CancellationToken::new(), move |robot| robot.follow(&same));
+    assert_eq!(moved.await.unwrap(), Err(DriverError::Stopped));
+    assert!(bench.travel_rad(0.3).await < 1e-3);
+    bench.enable(true).await;
+    bench
+        .until("held switch", |bench| bench.client.obstacle().is_none())
+        .await;
+    let begin = bench.joints();
+    let moved = bench.work(&CancellationToken::new(), move |robot| robot.follow(&turn));
+    bench
+        .until("motion", |bench| (bench.joints() - begin).amax() > 0.2)
+        .await;
+    bench.enable(false).await;
+    assert_eq!(moved.await.unwrap(), Err(DriverError::Stopped));
+    assert!(bench.travel_rad(0.3).await < 1e-3);
 }

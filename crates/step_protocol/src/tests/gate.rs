@@ -8,8 +8,8 @@ use nalgebra::{Isometry2, Vector2};
 use pick_place::{PickPlace, PrimitiveSettings};
 
 use crate::{
-    ApprovalGate, GateAction, GateRules, JointPositions, OperatorDecision, Proposal, ProposalId,
-    ProposalStatus, Proposed, RequireApproval, RobotState, StepOutcome,
+    ApprovalGate, CannotBegin, GateAction, GateRules, JointPositions, OperatorDecision, Proposal,
+    ProposalId, ProposalStatus, Proposed, Recovery, RequireApproval, RobotState, StepOutcome,
 };
 
 pub(super) const NOW: Duration = Duration::from_secs(100);
@@ -66,6 +66,8 @@ pub(super) fn proposal(id: u64) -> Proposal {
 pub(super) struct Robot {
     obstacle: Option<&'static str>,
     no_plan: Option<&'static str>,
+    /// Whether motions are still to be rehearsed.
+    unrehearsed: bool,
     /// Where every joint is (rad).
     joints_rad: f64,
 }
@@ -75,13 +77,18 @@ impl RobotState for Robot {
         self.obstacle.map(str::to_owned)
     }
 
-    fn plan(&self, _: &Proposal) -> Result<(), String> {
-        self.no_plan.map_or(Ok(()), |reason| Err(reason.to_owned()))
+    fn check_motion(&self, _: &Proposal) -> Result<(), CannotBegin> {
+        match self.no_plan {
+            _ if self.unrehearsed => Err(CannotBegin::NotRehearsed),
+            Some(reason) => Err(CannotBegin::Refused(reason.to_owned())),
+            None => Ok(()),
+        }
     }
 
-    fn plan_home(&self) -> Result<JointPositions, String> {
+    fn check_recovery(&self, _: Recovery) -> Result<JointPositions, CannotBegin> {
         match self.no_plan {
-            Some(reason) => Err(reason.to_owned()),
+            _ if self.unrehearsed => Err(CannotBegin::NotRehearsed),
+            Some(reason) => Err(CannotBegin::Refused(reason.to_owned())),
             None => Ok(JointPositions::repeat(self.joints_rad)),
         }
     }
@@ -90,7 +97,13 @@ impl RobotState for Robot {
 pub(super) const READY: Robot = Robot {
     obstacle: None,
     no_plan: None,
+    unrehearsed: false,
     joints_rad: 0.0,
+};
+
+const UNREHEARSED: Robot = Robot {
+    unrehearsed: true,
+    ..READY
 };
 
 fn empty() -> Arc<Heightmap> {
@@ -602,8 +615,13 @@ fn the_arm_goes_home_only_by_an_approval_of_that_very_proposal() {
         ..Robot::default()
     };
     let propose_home = |gate: &mut ApprovalGate, id, robot: &Robot| {
-        let proposed = gate.propose_home(ProposalId(id), robot);
-        proposed.map(|ProposalId(id)| id)
+        let proposed = gate.propose_home(ProposalId(id), Recovery::Home, robot);
+        proposed
+            .map(|ProposalId(id)| id)
+            .map_err(|cannot| match cannot {
+                CannotBegin::Refused(reason) => reason,
+                CannotBegin::NotRehearsed => "not rehearsed".to_owned(),
+            })
     };
     let reason = propose_home(&mut gate, 50, &stopped).unwrap_err();
     assert!(reason.contains("PROTECTIVE_STOP"), "{reason}");
@@ -656,7 +674,8 @@ fn a_stop_a_rejection_and_a_deactivation_withdraw_the_way_home() {
         (OperatorDecision::Reject, StepOutcome::Rejected),
     ] {
         let mut gate = gate();
-        gate.propose_home(ProposalId(50), &READY).unwrap();
+        gate.propose_home(ProposalId(50), Recovery::Home, &READY)
+            .unwrap();
         let actions = decide(&mut gate, 50, decision);
         assert!(
             matches!(&actions[..], [GateAction::Report(report)] if report.outcome == outcome),
@@ -666,7 +685,8 @@ fn a_stop_a_rejection_and_a_deactivation_withdraw_the_way_home() {
         assert_refused(&gate, actions, &["50", "was"]);
     }
     let mut gate = gate();
-    gate.propose_home(ProposalId(50), &READY).unwrap();
+    gate.propose_home(ProposalId(50), Recovery::Home, &READY)
+        .unwrap();
     gate.deactivate();
     let actions = approve(&mut gate, 50);
     assert_refused(&gate, actions, &["50", "withdrawn"]);
@@ -684,7 +704,7 @@ fn the_way_home_moves_unasked_only_where_nothing_needs_an_approval_and_nothing_w
             ..rules()
         });
         let id = ProposalId(50);
-        gate.propose_home(id, &READY).unwrap();
+        gate.propose_home(id, Recovery::Home, &READY).unwrap();
         assert_eq!(gate.moves_unasked(id), moves);
         gate.remember_stop();
         assert!(!gate.moves_unasked(id));
@@ -705,4 +725,78 @@ fn memory_is_bounded() {
     // What was forgotten is unknown again, what is remembered is superseded.
     assert_eq!(gate.status(ProposalId(8_000)), None);
     assert!(gate.status(ProposalId(9_500)).is_some());
+}
+
+#[test]
+fn what_is_held_is_put_down_by_an_approval_of_that_very_proposal_and_no_way_home_is() {
+    let mut gate = gate();
+    let propose =
+        |gate: &mut ApprovalGate, id, recovery| gate.propose_home(ProposalId(id), recovery, &READY);
+    propose(&mut gate, 50, Recovery::Home).unwrap();
+    // Another recovery is another proposal, and takes the place of the one before.
+    assert_eq!(
+        propose(&mut gate, 51, Recovery::PutDown),
+        Ok(ProposalId(51))
+    );
+    assert_eq!(
+        propose(&mut gate, 52, Recovery::PutDown),
+        Ok(ProposalId(51))
+    );
+    let refused = gate.on_confirmation(ProposalId(50), OperatorDecision::Approve, &READY, NOW);
+    assert!(
+        matches!(refused[..], [GateAction::Report(_)]),
+        "{refused:?}"
+    );
+    let moved = gate.on_confirmation(ProposalId(51), OperatorDecision::Approve, &READY, NOW);
+    assert_eq!(moved, [GateAction::PutDown(ProposalId(51))]);
+    gate.finish(NOW, false);
+    let again = gate.on_confirmation(ProposalId(51), OperatorDecision::Approve, &READY, NOW);
+    assert!(matches!(again[..], [GateAction::Report(_)]), "{again:?}");
+}
+
+#[test]
+fn an_approval_waits_for_the_rehearsal_of_its_motion_and_a_stop_ends_the_wait() {
+    let approve = OperatorDecision::Approve;
+    let id = ProposalId(7);
+    let mut gate = gate();
+    assert_eq!(gate.on_confirmation(id, approve, &UNREHEARSED, NOW), []);
+    let deadline = gate.deadline().unwrap();
+    assert!(deadline > NOW + rules().confirmation_grace);
+    assert_eq!(gate.on_news(&UNREHEARSED, deadline - GRACE), []);
+    let moved = gate.on_news(&READY, deadline - GRACE);
+    assert!(matches!(&moved[..], [GateAction::Move(moved)] if moved.id == id));
+
+    // Found to hit something.
+    let mut gate = self::gate();
+    assert_eq!(gate.on_confirmation(id, approve, &UNREHEARSED, NOW), []);
+    let hits = Robot {
+        no_plan: Some("the forearm would hit the table"),
+        ..READY
+    };
+    let actions = gate.on_news(&hits, NOW);
+    assert_refused(&gate, actions, &["forearm"]);
+
+    // Not rehearsed in time.
+    let mut gate = self::gate();
+    assert_eq!(gate.on_confirmation(id, approve, &UNREHEARSED, NOW), []);
+    let actions = gate.on_news(&UNREHEARSED, deadline);
+    assert_refused(&gate, actions, &["7", "has not been checked", "5s"]);
+
+    let mut gate = self::gate();
+    assert_eq!(gate.on_confirmation(id, approve, &UNREHEARSED, NOW), []);
+    gate.on_confirmation(id, OperatorDecision::Stop, &UNREHEARSED, NOW);
+    assert_eq!(gate.on_news(&READY, NOW), []);
+    assert_eq!(gate.pending(), None);
+}
+
+#[test]
+fn a_way_home_that_was_rehearsed_from_elsewhere_or_on_another_view_has_to_be_called_for_again() {
+    let mut gate = gate();
+    gate.propose_home(ProposalId(50), Recovery::Home, &READY)
+        .unwrap();
+    let approve = OperatorDecision::Approve;
+    let actions = gate.on_confirmation(ProposalId(50), approve, &UNREHEARSED, NOW);
+    assert_refused(&gate, actions, &["50", "call for it again"]);
+    let actions = decide(&mut gate, 50, approve);
+    assert_refused(&gate, actions, &["50", "withdrawn"]);
 }

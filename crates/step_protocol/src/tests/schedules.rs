@@ -16,11 +16,11 @@ use rand_chacha::ChaCha8Rng;
 
 use crate::mutation::{Mutation, plant};
 use crate::{
-    ApprovalGate, Change, Confirmation, Coverage, GateAction, GateRules, Goal, GoalSequence,
-    GoalTracker, Job, JointPositions, Judgement, Observation, Operator, OperatorDecision,
-    PlannerRules, Prediction, Proposal, ProposalId, ProposalPlanner, ProposalStatus, Proposed,
-    Question, RequireApproval, Reward, RobotState, ShownStep, StepJudge, StepOutcome, StepResult,
-    goals_of,
+    ApprovalGate, CannotBegin, Change, Confirmation, Coverage, GateAction, GateRules, Goal,
+    GoalSequence, GoalTracker, Job, JointPositions, Judgement, Observation, Operator,
+    OperatorDecision, PlannerRules, Prediction, Proposal, ProposalId, ProposalPlanner,
+    ProposalStatus, Proposed, Question, Recovery, RequireApproval, Reward, RobotState, ShownStep,
+    StepJudge, StepOutcome, StepResult, goals_of,
 };
 
 const WORKSPACE: Workspace = Workspace {
@@ -85,6 +85,8 @@ enum Action {
     Deactivate,
     /// The network answers.
     Predict,
+    /// The executor has rehearsed the pending proposal.
+    Rehearse,
     /// The motion ends so.
     EndMotion(usize),
     /// The cameras publish: the same heightmap, a newer one, a changed one.
@@ -117,7 +119,8 @@ impl Action {
             54..57 => Self::Lose(party, which),
             57..60 => Self::Restart(party),
             60 => Self::Deactivate,
-            61..70 => Self::Predict,
+            61..67 => Self::Predict,
+            67..70 => Self::Rehearse,
             70..79 => Self::EndMotion(which),
             79..85 => Self::Observe(which),
             85..91 => Self::Decide(party, which, other),
@@ -150,6 +153,8 @@ struct Robot {
     ready: bool,
     /// Where the arm is: 0 at home, where motions begin and end, something else where one was broken off.
     joints: u32,
+    /// The proposal whose motion was rehearsed from there.
+    rehearsed: Option<ProposalId>,
 }
 
 impl RobotState for Robot {
@@ -157,11 +162,14 @@ impl RobotState for Robot {
         (!self.ready).then(|| "protective stop".to_owned())
     }
 
-    fn plan(&self, _: &Proposal) -> Result<(), String> {
-        Ok(())
+    fn check_motion(&self, proposal: &Proposal) -> Result<(), CannotBegin> {
+        match self.rehearsed == Some(proposal.id) {
+            true => Ok(()),
+            false => Err(CannotBegin::NotRehearsed),
+        }
     }
 
-    fn plan_home(&self) -> Result<JointPositions, String> {
+    fn check_recovery(&self, _: Recovery) -> Result<JointPositions, CannotBegin> {
         Ok(JointPositions::repeat(f64::from(self.joints)))
     }
 }
@@ -291,6 +299,7 @@ impl World {
             robot: Robot {
                 ready: true,
                 joints: 0,
+                rehearsed: None,
             },
             now: Duration::ZERO,
             clock_runs,
@@ -399,6 +408,7 @@ impl World {
             Party::Gate => {
                 // The watchdog stops the arm; nobody reports a result.
                 self.gate = gate();
+                self.robot.rehearsed = None;
                 self.moved_since_start.clear();
                 self.approvals.clear();
                 self.newest_at_gate = None;
@@ -701,6 +711,9 @@ impl World {
                     if !published.is_some_and(|published| published.contains(&proposal)) {
                         return violation(format!("{id} moves otherwise than it was published"));
                     }
+                    if self.robot.rehearsed != Some(id) {
+                        return violation(format!("{id} moves and was not rehearsed"));
+                    }
                     if !self.moved_since_start.insert(id) {
                         return violation(format!("{id} moves twice"));
                     }
@@ -709,7 +722,7 @@ impl World {
                     self.cancelled = false;
                     self.motion = Some(Motion::Proposal(proposal));
                 }
-                GateAction::GoHome(id) => {
+                GateAction::GoHome(id) | GateAction::PutDown(id) => {
                     if self.motion.is_some() {
                         return violation(format!("{id} moves the arm home while it moves"));
                     }
@@ -768,6 +781,7 @@ impl World {
             true => StepOutcome::Stopped,
             false => outcome,
         };
+        self.robot.rehearsed = None;
         let changes = outcome == StepOutcome::Placed || delta_reward != 0.0;
         self.move_scene(if changes { 0.1 } else { 0.0 });
         let end = self.seen.stamp;
@@ -921,6 +935,7 @@ impl World {
                 self.send_latched(Party::Gate);
             }
             Action::Predict => return self.predict(),
+            Action::Rehearse => return self.rehearse(),
             Action::EndMotion(which) => {
                 let ends = [
                     (StepOutcome::Placed, 1.0),
@@ -968,7 +983,7 @@ impl World {
             Action::Obstacle(obstacle) => self.robot.ready = !obstacle,
             Action::Home => {
                 let new = ProposalId(1_000_000 + self.homes.len() as u64);
-                let Ok(id) = self.gate.propose_home(new, &self.robot) else {
+                let Ok(id) = self.gate.propose_home(new, Recovery::Home, &self.robot) else {
                     return Ok(());
                 };
                 if self.motion.is_some() {
@@ -1030,7 +1045,18 @@ impl World {
         ))
     }
 
-    /// Everything on its way arrives, the network answers, motions end.
+    /// The pending proposal, where it is to be rehearsed.
+    fn unrehearsed(&self) -> Option<ProposalId> {
+        let pending = self.gate.pending().map(|pending| pending.id);
+        pending.filter(|_| pending != self.robot.rehearsed)
+    }
+
+    fn rehearse(&mut self) -> Check {
+        self.robot.rehearsed = self.unrehearsed().or(self.robot.rehearsed);
+        self.ask_gate()
+    }
+
+    /// Everything on its way arrives, the network answers, motions are rehearsed and end.
     fn settle(&mut self) -> Check {
         for _ in 0..10_000 {
             let mut quiet = true;
@@ -1043,6 +1069,10 @@ impl World {
             if self.job.is_some() {
                 quiet = false;
                 self.predict()?;
+            }
+            if self.unrehearsed().is_some() {
+                quiet = false;
+                self.rehearse()?;
             }
             if quiet && self.motion.is_some() {
                 quiet = false;

@@ -8,7 +8,6 @@ use step_protocol::{ProposalId, Report, StepOutcome, StepResult};
 use tracing::{error, info, warn};
 
 use super::Executor;
-use super::motion::Cause;
 
 impl Executor<'_> {
     /// A refusal with where the proposal stands.
@@ -79,8 +78,7 @@ impl Executor<'_> {
         // What an operator's approval has led to.
         let motion = match self.motion.as_ref().map(|motion| motion.cause) {
             None => "at rest".to_owned(),
-            Some(Cause::Home(_)) => "goes home".to_owned(),
-            Some(Cause::Proposal(id)) => format!("carries out proposal {id}"),
+            Some(cause) => cause.text(),
         };
         diagnostics.set("motion", Level::Ok, motion, []);
     }

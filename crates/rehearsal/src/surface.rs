@@ -2,10 +2,7 @@
 
 use heightmap::Heightmap;
 use nalgebra::Point2;
-use pick_place::{PickPlace, Touchdown};
-use ur_driver::ContactSign;
-
-use crate::parameters::Contact;
+use pick_place::{ContactSettings, ContactSign, PickPlace, Touchdown};
 
 /// The cup rests on what is this near (m).
 const CUP_RADIUS_M: f64 = 0.008;
@@ -22,10 +19,10 @@ const GROUND: f64 = 0.05;
 ///
 /// # Errors
 /// Names the pose at which nothing was seen.
-pub(crate) fn touchdown(
+pub fn touchdown(
     heightmap: &Heightmap,
     action: &PickPlace,
-    contact: &Contact,
+    contact: &ContactSettings,
     sign: ContactSign,
 ) -> Result<Option<Touchdown>, String> {
     if contact.slow_from_m <= 0.0 {
@@ -121,10 +118,10 @@ mod tests {
         }
     }
 
-    fn slow() -> Contact {
-        Contact {
+    fn slow() -> ContactSettings {
+        ContactSettings {
             slow_from_m: 0.03,
-            ..Contact::default()
+            ..ContactSettings::default()
         }
     }
 
@@ -163,9 +160,9 @@ mod tests {
 
     #[test]
     fn without_a_slow_part_the_surfaces_do_not_count_and_contact_has_to_be_sensed() {
-        let fast = Contact {
+        let fast = ContactSettings {
             slow_from_m: 0.0,
-            ..Contact::default()
+            ..ContactSettings::default()
         };
         let of = |sign| touchdown(&table(), &action(), &fast, sign);
         assert_eq!(of(ContactSign::UntilAction), Ok(None));

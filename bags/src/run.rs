@@ -22,7 +22,7 @@ pub struct LeftOut {
     pub attempt: u32,
     /// The proposal.
     pub proposal_id: u64,
-    /// Why.
+    /// The reason.
     pub reason: String,
 }
 

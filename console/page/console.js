@@ -714,12 +714,13 @@ function renderMotion() {
 const cameras = new CameraViews(api, $("cameras"), $("camera-list"));
 
 /** Who made a proposal, and how sure of it; a person's corrections have no scores. */
-function whose({ author, checkpoint, pick_score, place_score, success_probability }) {
+function whose({ author, checkpoint, pick_score, place_score, success_probability, verdict }) {
   const percent = (share) => `${Math.round(100 * share)} %`;
   if (!checkpoint && author) return ` Made by ${author}.`;
   const by = author ? ` Made by ${author}${checkpoint ? ` with ${checkpoint}` : ""}.` : "";
   const success = success_probability == null ? "" : ` It expects the step to succeed with ${percent(success_probability)}.`;
-  return `${by} Its scores: pick ${percent(pick_score)}, place ${percent(place_score)}.${success}`;
+  const doubt = verdict ? ` Look closely: ${verdict}.` : "";
+  return `${by} Its scores: pick ${percent(pick_score)}, place ${percent(place_score)}.${success}${doubt}`;
 }
 
 /** A small picture in a list, with its caption. */

@@ -51,7 +51,7 @@ pub struct CameraState {
     cy_px: f64,
     /// Lens after plumb_bob: k1, k2, p1, p2, k3.
     distortion: [f64; 5],
-    /// Pose of the optical frame in the world, row by row: rotation and translation (m); nothing where it is not known.
+    /// Pose of the optical frame in the world, row by row: rotation and translation (m); `None` where it is not known.
     pose: Option<[[f64; 4]; 3]>,
 }
 

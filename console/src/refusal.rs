@@ -7,7 +7,7 @@ use step_protocol::{ProposalStatus, RefusalKind};
 #[derive(Clone, Debug, PartialEq, Eq, Serialize, thiserror::Error)]
 #[error("{reason} {advice}")]
 pub struct Refusal {
-    /// Why.
+    /// The reason.
     pub reason: String,
     /// What to do next.
     pub advice: String,

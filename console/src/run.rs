@@ -62,7 +62,7 @@ enum Status {
 struct Offered {
     proposal: Proposal,
     status: Status,
-    /// What has changed on the table since the heightmap that it was made from; nothing where that one is not known.
+    /// What has changed on the table since the heightmap that it was made from; `None` where that one is not known.
     change: Option<TableChange>,
 }
 

@@ -88,6 +88,7 @@ pub(crate) fn proposal(id: u64) -> Proposal {
         pick_score: 0.5,
         place_score: 0.5,
         success_probability: None,
+        done_probability: None,
         checkpoint: String::new(),
         author: String::new(),
     }

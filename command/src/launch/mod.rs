@@ -196,7 +196,7 @@ impl Launch {
         Ok(())
     }
 
-    /// What the run repeats; nothing where the problem has no goals: then a person teaches it.
+    /// What the run repeats; `None` where the problem has no goals: then a person teaches it.
     fn demonstration(
         &self,
         problem: &Problem,
@@ -467,10 +467,10 @@ impl Desk {
                 () = tokio::time::sleep(LAST_RESULT), if self.goals_reached && !self.confirms => break,
                 () = silence, if kind == OperatorKind::Auto => {
                     questions = self.operator.on_silence();
-                    tracing::warn!("no step has gone on for {} s: what was said last is repeated", SILENCE.as_secs());
+                    tracing::warn!("no step has gone on for {} s: repeating the last decision", SILENCE.as_secs());
                 }
                 () = tokio::time::sleep(PATIENCE), if alone => {
-                    bail!("nothing heard for {} s; no node said why: see the logs", PATIENCE.as_secs());
+                    bail!("no message from any node for {} s: see the logs of the nodes", PATIENCE.as_secs());
                 }
             }
             heard = Instant::now();

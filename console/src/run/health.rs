@@ -16,7 +16,7 @@ pub(super) struct NodeHealth {
     pub(super) heard: Duration,
     /// Name of the state, level, message.
     pub(super) states: BTreeMap<String, (u8, String)>,
-    /// Age of each camera stream when the diagnostics were sent [s]; nothing where none has come.
+    /// Age of each camera stream when the diagnostics were sent [s]; `None` where none has come.
     pub(super) images: BTreeMap<String, Option<f64>>,
 }
 

@@ -164,6 +164,7 @@ impl Shown<'_> {
             pick_score: 0.0,
             place_score: 0.0,
             success_probability: None,
+            done_probability: None,
             checkpoint: String::new(),
             author: self.author.to_owned(),
         })

@@ -122,6 +122,10 @@ pub struct ProposalState<'a> {
     place_score: f32,
     /// Nothing where nothing estimates it.
     success_probability: Option<f32>,
+    /// Nothing where nothing estimates it.
+    done_probability: Option<f32>,
+    /// What the estimates say against carrying it out, for people; empty where nothing.
+    verdict: &'static str,
     checkpoint: &'a str,
     author: &'a str,
     stamp_s: f64,
@@ -139,6 +143,8 @@ impl<'a> ProposalState<'a> {
             pick_score: proposal.pick_score,
             place_score: proposal.place_score,
             success_probability: proposal.success_probability,
+            done_probability: proposal.done_probability,
+            verdict: proposal.verdict().text(),
             checkpoint: &proposal.checkpoint,
             author: &proposal.author,
             stamp_s: proposal.stamp.as_secs_f64(),

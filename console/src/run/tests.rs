@@ -261,6 +261,7 @@ fn who_made_a_proposal_and_how_likely_it_succeeds_is_shown() {
     run.on_proposal(made).unwrap();
     let shown = shown(&run);
     assert_eq!(shown["success_probability"], 0.75);
+    assert_eq!(shown["verdict"], "");
     assert_eq!(
         (&shown["checkpoint"], &shown["author"]),
         (&"stacking".into(), &"gctn_policy".into())
@@ -276,6 +277,31 @@ fn who_made_a_proposal_and_how_likely_it_succeeds_is_shown() {
         ("Ada", None)
     );
     assert_eq!(corrected.checkpoint, "");
+}
+
+#[test]
+fn a_goal_that_looks_reached_and_a_policy_that_does_not_know_are_shown() {
+    let mut run = proposed();
+    let mut verdict = |success: Option<f32>, done: Option<f32>| {
+        let made = Proposal {
+            success_probability: success,
+            done_probability: done,
+            ..proposal(8, 1, 0, 10)
+        };
+        run.on_proposal(made).unwrap();
+        let shown = serde_json::to_value(run.snapshot(NOW)).unwrap();
+        shown["proposal"]["verdict"].as_str().unwrap().to_owned()
+    };
+    assert_eq!(
+        verdict(Some(0.9), Some(0.8)),
+        "the goal of this step looks reached already"
+    );
+    assert_eq!(
+        verdict(Some(0.1), Some(0.2)),
+        "the policy does not know how to reach the goal"
+    );
+    assert_eq!(verdict(Some(0.9), Some(0.2)), "");
+    assert_eq!(verdict(None, None), "");
 }
 
 #[test]

@@ -1,4 +1,4 @@
-//! Who may ask, and what an answer is that is none.
+//! Authentication, and the responses to requests that fail.
 
 use std::net::SocketAddr;
 use std::time::Duration;
@@ -110,7 +110,7 @@ impl Access {
     }
 }
 
-/// An answer that is none: status, and words for a person.
+/// The response to a request that failed: HTTP status, and a message for a person.
 #[derive(Debug)]
 pub(super) struct Failure {
     status: StatusCode,

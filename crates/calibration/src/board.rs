@@ -23,7 +23,7 @@ pub struct Board {
     pub first_id: usize,
 }
 
-/// A board that cannot be.
+/// A dimension of the board is out of range.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 #[error("board.{field} is {value}, expected {expected}")]
 pub struct BoardError {

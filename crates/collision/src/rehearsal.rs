@@ -1,4 +1,4 @@
-//! A whole pick and place carried out in thought, each motion checked before it would begin.
+//! Collision check of all motions of a pick and place, from its start to its end.
 
 use crate::{Carried, Clearance, Collision, CollisionChecker, Contact, Scene, Terrain, lift_out};
 use heightmap::Heightmap;

@@ -22,7 +22,7 @@ pub enum SwitchError {
     Refused {
         /// The controller.
         name: String,
-        /// Why.
+        /// The reason.
         reason: String,
     },
 }

@@ -145,7 +145,7 @@ pub struct Fused {
     pub report: FusionReport,
     /// Of the newest image.
     pub stamp: Duration,
-    /// By camera; nothing where it was left out.
+    /// By camera; `None` where it was left out.
     pub used: Vec<Option<Used>>,
 }
 

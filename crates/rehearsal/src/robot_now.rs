@@ -326,7 +326,7 @@ impl RobotNow {
         Ok(robot.motion())
     }
 
-    /// What the gripper holds, and the heightmap without it; nothing where it holds nothing, or nobody saw it.
+    /// What the gripper holds, and the heightmap without it; `None` where it holds nothing, or nobody saw it.
     fn lifted_out(&self, holds: bool) -> Option<(Carried, Heightmap)> {
         let picked = self.picked.as_ref().filter(|_| holds)?;
         let top_m = top_m(&picked.seen, &Point2::from(picked.tip.translation.vector))?;
@@ -410,6 +410,7 @@ mod tests {
             pick_score: 1.0,
             place_score: 1.0,
             success_probability: None,
+            done_probability: None,
             checkpoint: String::new(),
             author: "test".into(),
         }

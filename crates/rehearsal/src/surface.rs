@@ -15,7 +15,7 @@ const TOP: f64 = 0.9;
 /// Of the cells beside an object this share is lower than its ground.
 const GROUND: f64 = 0.05;
 
-/// How the tip comes down for an action; nothing where the descents are to be fast to their end.
+/// How the tip comes down for an action; `None` where the descents are to be fast to their end.
 ///
 /// # Errors
 /// Names the pose at which nothing was seen.
@@ -55,12 +55,12 @@ pub fn touchdown(
     }))
 }
 
-/// The height of what the cup meets at a point (m); nothing where none was seen.
+/// The height of what the cup meets at a point (m); `None` where none was seen.
 pub(crate) fn top_m(heightmap: &Heightmap, at: &Point2<f64>) -> Option<f64> {
     quantile_m(heightmap, at, CUP_RADIUS_M, TOP)
 }
 
-/// The height that a share of the cells around a point do not exceed (m); nothing where none was seen.
+/// The height that a share of the cells around a point do not exceed (m); `None` where none was seen.
 fn quantile_m(
     heightmap: &Heightmap,
     center: &Point2<f64>,

@@ -80,7 +80,7 @@ pub enum InvalidOutput {
         /// The last one.
         last: u8,
     },
-    /// A level that is none.
+    /// The level of the pin is neither 0 nor 1.
     #[error("state is {0}, expected 0 or 1")]
     Level(f32),
     /// A voltage that the tool cannot be fed with.

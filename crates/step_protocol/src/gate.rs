@@ -12,7 +12,7 @@ use nalgebra::SVector;
 use pick_place::{PickPlace, PrimitiveSettings};
 
 use crate::mutation::{Mutation, planted};
-use crate::{OperatorDecision, Proposal, ProposalId, ProposalStatus, StepOutcome};
+use crate::{OperatorDecision, Proposal, ProposalId, ProposalStatus, StepOutcome, Verdict};
 
 /// Heightmaps kept, by stamp, until the proposals that were made from them arrive.
 const HEIGHTMAPS: usize = 64;
@@ -30,7 +30,7 @@ const REHEARSAL_GRACE: Duration = Duration::from_secs(5);
 pub enum RequireApproval {
     /// Every one.
     Always,
-    /// Those without a probability of success of at least `threshold`.
+    /// Those without a probability of success of at least `threshold`, and those whose goal looks reached already.
     Unsure {
         /// From 0 to 1.
         threshold: f32,
@@ -43,9 +43,11 @@ impl RequireApproval {
     fn of(&self, proposal: &Proposal) -> bool {
         match self {
             Self::Always => true,
-            Self::Unsure { threshold } => !proposal
-                .success_probability
-                .is_some_and(|probability| probability >= *threshold),
+            Self::Unsure { threshold } => {
+                let success = proposal.success_probability;
+                let is_sure = success.is_some_and(|success| success >= *threshold);
+                !is_sure || proposal.verdict() == Verdict::Done
+            }
             Self::Never => false,
         }
     }
@@ -192,12 +194,12 @@ pub enum Refusal {
         /// The proposal.
         id: ProposalId,
     },
-    /// The robot cannot move now, or not so.
+    /// The robot is not ready, or the proposed motion is not feasible.
     #[error("proposal {id}: {reason}")]
     Robot {
         /// The proposal.
         id: ProposalId,
-        /// Why.
+        /// The reason.
         reason: String,
     },
     /// Made from what was seen before the last motion ended.

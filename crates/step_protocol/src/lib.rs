@@ -35,5 +35,5 @@ pub use tracker::{
 };
 pub use types::{
     Confirmation, Coverage, Goal, Observation, OperatorDecision, Proposal, ProposalId,
-    ProposalStatus, Reward, StepOutcome, StepResult, yaw_rad,
+    ProposalStatus, Reward, StepOutcome, StepResult, Verdict, yaw_rad,
 };

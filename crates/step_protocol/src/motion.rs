@@ -1,4 +1,4 @@
-//! What moves the arm, what stops it, and what is said of its end.
+//! Causes and stops of motions, and the reported results.
 
 use pick_place::{Outcome, Phase};
 

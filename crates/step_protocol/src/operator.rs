@@ -19,7 +19,7 @@ pub enum Question {
     Confirm {
         /// What the executor said of the motion.
         result: StepResult,
-        /// The reward that the simulator measured after it; none where nothing measures one, or its message was lost.
+        /// The reward that the simulator measured after it; `None` where nothing measures one, or its message was lost.
         reward: Option<Reward>,
         /// Whether the proposal was for the last goal of the demonstration.
         is_last_goal: bool,

@@ -6,7 +6,7 @@ use std::time::Duration;
 #[derive(Clone, Copy, Debug)]
 pub struct Presence {
     timeout: Duration,
-    /// When it was last said that the operator is present; nothing since it was said that nobody is.
+    /// When the last message with `is_present` came; `None` after one without.
     present_at: Option<Duration>,
 }
 
@@ -24,7 +24,7 @@ impl Presence {
         self.present_at = is_present.then_some(now);
     }
 
-    /// When the operator will not be present any more without another sign; nothing where nobody is.
+    /// When the presence expires without another message; `None` while nobody is present.
     pub fn deadline(&self) -> Option<Duration> {
         Some(self.present_at? + self.timeout)
     }

@@ -10,7 +10,7 @@ use msgs::sensor_msgs::{CameraInfo, Image};
 use msgs::tf2_msgs::TFMessage;
 use node_kit::{Node, Qos};
 
-/// How often it is looked whether somebody looks.
+/// Time between checks whether a browser shows camera images.
 const POLL: Duration = Duration::from_millis(250);
 
 /// Keeps the transforms, for as long as the node is active.

@@ -275,7 +275,7 @@ fn read_demonstration(path: &Path) -> anyhow::Result<(String, Vec<Heightmap>)> {
     Ok((demonstration.name(), images))
 }
 
-/// Shows the images of a demonstration before they are latched. Returns its name in the goals; nothing where it cannot be read.
+/// Shows the images of a demonstration before they are latched. Returns its name in the goals; `None` where it cannot be read.
 pub async fn show_demonstration(node: &Node, console: &Console, path: PathBuf) -> Option<String> {
     let reading = path.clone();
     let read = node.spawn_blocking(move || read_demonstration(&reading));

@@ -57,10 +57,10 @@ pub enum ContextError {
     Middleware {
         /// The domain.
         domain_id: u16,
-        /// Why.
+        /// The reason.
         reason: String,
     },
-    /// Somebody is in each of them.
+    /// Every domain id has participants.
     #[error("no ROS domain id from 1 to {LAST_DOMAIN_ID} is unused on this machine")]
     NoUnusedDomain,
 }

@@ -54,11 +54,11 @@ pub trait Active: Send + 'static {
 pub enum State {
     /// Only parameters and lifecycle are there.
     Unconfigured = 1,
-    /// Everything is loaded; nothing is heard or said.
+    /// Everything is loaded; no topic is subscribed or published.
     Inactive = 2,
-    /// At work.
+    /// Topics, services and actions work.
     Active = 3,
-    /// Nothing goes on from here but the end of the process.
+    /// The process is about to end.
     Finalized = 4,
     /// On the way.
     Configuring = 10,

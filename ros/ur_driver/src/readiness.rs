@@ -77,7 +77,7 @@ pub(crate) fn watch_readiness(
             let silent = matches!(found, Readiness::Unchecked(_));
             if found != before && !(silent && before == Readiness::Ready) {
                 match &found {
-                    Readiness::Ready => info!("the driver has what is needed"),
+                    Readiness::Ready => info!("the driver is ready"),
                     Readiness::Unchecked(reason) | Readiness::Refused(reason) => warn!("{reason}"),
                 }
                 sender.send_replace(found.clone());

@@ -56,6 +56,7 @@ pub(super) fn proposal(id: u64) -> Proposal {
         pick_score: 1.0,
         place_score: 1.0,
         success_probability: None,
+        done_probability: None,
         checkpoint: String::new(),
         author: "test".into(),
     }
@@ -336,6 +337,21 @@ fn only_a_proposal_that_is_sure_enough_moves_unasked_and_none_after_a_stop() {
         assert_eq!(gate.moves_unasked(ProposalId(id)), moves, "{id}");
         assert!(!gate.moves_unasked(ProposalId(id - 1)), "{id}");
     }
+    // However sure the policy is of it: there may be nothing to do.
+    let done = Proposal {
+        success_probability: Some(1.0),
+        done_probability: Some(0.6),
+        ..proposal(12)
+    };
+    propose(&mut gate, done);
+    assert!(!gate.moves_unasked(ProposalId(12)));
+    propose(
+        &mut gate,
+        Proposal {
+            success_probability: Some(0.9),
+            ..proposal(10)
+        },
+    );
     decide(&mut gate, 10, OperatorDecision::Stop);
     let sure = Proposal {
         success_probability: Some(1.0),

@@ -29,6 +29,7 @@ fn proposal(id: u64, stamp_s: u64) -> Proposal {
         pick_score: 1.0,
         place_score: 1.0,
         success_probability: None,
+        done_probability: None,
         checkpoint: String::new(),
         author: "test".into(),
     }

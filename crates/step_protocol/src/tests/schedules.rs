@@ -284,6 +284,7 @@ fn predict(job: &Job) -> Result<Prediction, String> {
         pick_score: 1.0,
         place_score: 1.0,
         success_probability: None,
+        done_probability: None,
     })
 }
 
@@ -852,6 +853,7 @@ impl World {
             pick_score: 1.0,
             place_score: 1.0,
             success_probability: None,
+            done_probability: None,
             checkpoint: String::new(),
             author: "somebody".into(),
         };

@@ -1,4 +1,4 @@
-//! Motions: their start, their end, and what is said of it.
+//! Motions: start, end, reported result.
 
 use std::hash::{DefaultHasher, Hash as _, Hasher as _};
 use std::sync::Arc;

@@ -36,7 +36,7 @@ impl Executor<'_> {
     }
 
     pub(super) fn on_confirmation(&mut self, message: sctn_msgs::StepConfirmation) {
-        // What was sent before it is to be known before it.
+        // DDS may deliver messages of several topics in another order than they were sent: take what has arrived first.
         while let Some(heightmap) = self.heightmaps.try_recv() {
             self.on_heightmap(heightmap);
         }

@@ -17,7 +17,7 @@ use ur_driver::planted::{Planted, is_planted};
 
 use super::Executor;
 
-/// What was rehearsed, is being rehearsed and is to be.
+/// Finished, running and waiting rehearsals.
 #[derive(Default)]
 pub(super) struct Rehearsals {
     task: Option<JoinHandle<Rehearsed>>,

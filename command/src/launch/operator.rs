@@ -124,7 +124,7 @@ pub fn confirmation(
     operator_name: &str,
 ) -> Result<sctn_msgs::StepConfirmation> {
     let confirmation = Confirmation {
-        stamp: Duration::from_nanos(node.clock().now_ns().max(0) as u64),
+        stamp: node.clock().time(),
         proposal_id,
         decision,
         operator_name: operator_name.into(),

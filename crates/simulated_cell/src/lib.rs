@@ -296,11 +296,6 @@ impl SimulatedCell {
         &self.environment
     }
 
-    /// The simulation.
-    pub fn environment_mut(&mut self) -> &mut Environment {
-        &mut self.environment
-    }
-
     /// Simulated time, over all episodes.
     pub fn time(&self) -> Duration {
         self.past + self.environment.cell().time()

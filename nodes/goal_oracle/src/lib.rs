@@ -343,7 +343,7 @@ impl OracleNode {
 
     fn refuse(&self, id: ProposalId, refusal: &ConfirmationRefusal) {
         warn!("confirmation refused: {refusal}");
-        let now = Duration::from_nanos(self.node.clock().now_ns().max(0) as u64);
+        let now = self.node.clock().time();
         let world = &self.parameters.world_frame;
         match convert::confirmation_refused_to_msg(id, refusal, now, world) {
             Ok(message) => self.refusals.publish(message),

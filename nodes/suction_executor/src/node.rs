@@ -331,7 +331,7 @@ impl Executor<'_> {
             at_home: status.at_home,
             unseen: self.has_publisher && self.publishers() == 0,
             needs_home: self.parameters.observation_needs_home,
-            time: Duration::from_nanos(self.node.clock().now_ns().max(0) as u64),
+            time: self.node.clock().time(),
             seen: self.seen.clone(),
             observation_max_age: Duration::from_secs_f64(self.parameters.observation_max_age_s),
             contact: self.parameters.contact,

@@ -246,11 +246,6 @@ impl Context {
         Ok(tokio::spawn(life.instrument(span)))
     }
 
-    /// Cancelled when all nodes of this context are to end.
-    pub fn shutdown_token(&self) -> &CancellationToken {
-        &self.shutdown
-    }
-
     /// Ends all nodes of this context.
     pub fn shutdown(&self) {
         self.shutdown.cancel();

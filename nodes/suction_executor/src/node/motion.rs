@@ -183,7 +183,7 @@ impl Executor<'_> {
         };
         self.node.diagnostics().set("motion", level, &reason, []);
         // Observations from then on show the result. Simulated time may still be on its way.
-        let now = Duration::from_nanos(self.node.clock().now_ns().max(0) as u64);
+        let now = self.node.clock().time();
         let end = stamps.map_or(now, |(_, last)| last.max(now));
         let duration = stamps.map_or(Duration::ZERO, |(first, last)| last - first.min(last));
         let actions = self.gate.finish(end, broken_off.is_some());

@@ -46,7 +46,7 @@ impl Executor<'_> {
         report: Report,
         motion: Option<(Duration, Duration)>,
     ) -> sctn_msgs::StepResult {
-        let now = Duration::from_nanos(self.node.clock().now_ns().max(0) as u64);
+        let now = self.node.clock().time();
         let (stamp, duration) = motion.unwrap_or((now, Duration::ZERO));
         let result = StepResult {
             stamp,

@@ -179,6 +179,29 @@ enum Descent {
 }
 
 impl PickPlace {
+    /// x (m), y (m), yaw (rad) of the pick, then of the place.
+    ///
+    /// ```
+    /// let action = pick_place::PickPlace::from_array([0.3, 0.1, 0.0, 0.5, -0.2, 1.5]);
+    /// assert_eq!(action.to_array()[3..], [0.5, -0.2, 1.5]);
+    /// ```
+    pub fn to_array(&self) -> [f64; 6] {
+        let pose = |pose: &Isometry2<f64>| {
+            let position = pose.translation.vector;
+            [position.x, position.y, pose.rotation.angle()]
+        };
+        let ([a, b, c], [d, e, f]) = (pose(&self.pick), pose(&self.place));
+        [a, b, c, d, e, f]
+    }
+
+    /// The action of [`PickPlace::to_array`].
+    pub fn from_array([x, y, yaw, to_x, to_y, to_yaw]: [f64; 6]) -> Self {
+        Self {
+            pick: Isometry2::new([x, y].into(), yaw),
+            place: Isometry2::new([to_x, to_y].into(), to_yaw),
+        }
+    }
+
     /// Poses of the tip at pick and place. The cup is round: only the turn from pick to place counts. Half of it before and half after keeps
     /// wrist 3 away from its limits.
     pub fn tips(&self) -> (Isometry2<f64>, Isometry2<f64>) {

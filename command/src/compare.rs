@@ -4,7 +4,7 @@ use crate::root::Root;
 use anyhow::{Context, Result, bail};
 use bags::Demonstration;
 use clap::Args;
-use gctn::{Goal, GoalConditioning, Policy};
+use gctn::{Device, Goal, GoalConditioning, Policy, Precision};
 use heightmap::Heightmap;
 use learning::recorded_run;
 use nalgebra::Isometry2;
@@ -19,6 +19,9 @@ pub struct Compare {
     /// Checkpoints of the policies
     #[arg(long, required = true, num_args = 1..)]
     checkpoints: Vec<PathBuf>,
+    /// Where the policies compute: cpu, cuda or cuda:N
+    #[arg(long, default_value_t)]
+    device: Device,
     /// Bags with steps that none of them was trained on: demonstrations, taught tasks or recorded runs
     #[arg(long, required = true, num_args = 1..)]
     demos: Vec<PathBuf>,
@@ -110,9 +113,11 @@ struct Report {
 
 impl Compare {
     pub fn run(self, _: &Root) -> Result<()> {
+        self.device.check()?;
         gctn::set_threads(1);
         let load = |path: &PathBuf| {
-            Policy::load(path).with_context(|| format!("--checkpoints: {}", path.display()))
+            Policy::load_for(path, self.device, Precision::F32)
+                .with_context(|| format!("--checkpoints: {}", path.display()))
         };
         let policies = self.checkpoints.iter().map(load);
         let policies: Vec<_> = policies.collect::<Result<_>>()?;

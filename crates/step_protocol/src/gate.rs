@@ -12,7 +12,7 @@ use nalgebra::SVector;
 use pick_place::{PickPlace, PrimitiveSettings};
 
 use crate::mutation::{Mutation, planted};
-use crate::{OperatorDecision, Proposal, ProposalId, ProposalStatus, StepOutcome, Verdict};
+use crate::{OperatorDecision, Proposal, ProposalId, ProposalStatus, StepOutcome};
 
 /// Heightmaps kept, by stamp, until the proposals that were made from them arrive.
 const HEIGHTMAPS: usize = 64;
@@ -46,7 +46,7 @@ impl RequireApproval {
             Self::Unsure { threshold } => {
                 let success = proposal.success_probability;
                 let is_sure = success.is_some_and(|success| success >= *threshold);
-                !is_sure || proposal.verdict() == Verdict::Done
+                !is_sure || proposal.verdict() == crate::Verdict::Done
             }
             Self::Never => false,
         }

@@ -227,7 +227,7 @@ def watch(bench: Bench) -> None:
     for action in (FOLLOW_ACTION, UNTIL_ACTION):
         node.create_subscription(GoalStatusArray, f"{action}/_action/status", goals_of(action), LATCHED)
     node.create_subscription(JointState, "joint_states", on_joints, ALL)
-    node.create_subscription(IOStates, "io_and_status_controller/io_states", on_pins, STREAM)
+    node.create_subscription(IOStates, "io_and_status_controller/io_states", on_pins, ALL)
 
 
 def time_message(seconds: float) -> Time:

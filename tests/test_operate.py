@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import copy
+
 import numpy as np
 import pytest
 from campaign_cell import arguments
 from cell_operator import Operator
 from processes import Process
+from rclpy.action import ActionClient
+from sctn_msgs.action import ExecutePickPlace
 from sctn_msgs.msg import PickPlace, StepConfirmation, StepResult
 from test_hardware import look_at, propose, wait_until_moving
 from test_refusals import Cell
@@ -91,6 +95,24 @@ def test_a_person_at_the_terminal_rejects_approves_stops_and_calls_the_arm_home(
     terminal.says("n")
     operator.until(lambda: decided and decided[-1].decision == StepConfirmation.RETRY, "RETRY", 30.0)
     assert {said.operator_name for said in decided} == {"anna"}
+
+
+def test_a_goal_of_the_action_is_offered_at_the_terminal(terminal: Terminal) -> None:
+    operator = terminal.cell.operator
+    execute = ActionClient(operator.node, ExecutePickPlace, "execute_pick_place")
+    operator.until(execute.server_is_ready, "action", 30.0)
+    operator.until(lambda: operator.node.get_subscriptions_info_by_topic("/pick_place_goal"), "terminal that hears goals", 30.0)
+    proposal = propose(terminal.cell)
+    terminal.shows("carry it out?")
+    goal = copy.deepcopy(proposal)
+    goal.id = proposal.id + 1000
+    sending = execute.send_goal_async(ExecutePickPlace.Goal(proposal=goal))
+    operator.until(sending.done, "answer to the goal", 30.0)
+    assert sending.result().accepted
+    terminal.shows("carry it out?")
+    after = operator.count("step_result")
+    terminal.says("n")
+    assert ended(terminal, after, goal.id).outcome == StepResult.REJECTED
 
 
 def test_an_arm_whose_terminal_is_closed_in_mid_motion_stops(terminal: Terminal) -> None:

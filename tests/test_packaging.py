@@ -89,7 +89,7 @@ def launch_modules(monkeypatch: pytest.MonkeyPatch) -> None:
         "launch": ["LaunchDescription"],
         "launch.actions": ["DeclareLaunchArgument"],
         "launch.conditions": ["IfCondition"],
-        "launch.substitutions": ["Command", "LaunchConfiguration", "PathJoinSubstitution"],
+        "launch.substitutions": ["Command", "EnvironmentVariable", "LaunchConfiguration", "PathJoinSubstitution"],
         "launch_ros": [],
         "launch_ros.actions": ["Node"],
         "launch_ros.parameter_descriptions": ["ParameterValue"],
@@ -137,14 +137,33 @@ def test_what_a_launch_file_names_is_there(launch_modules, file: pathlib.Path) -
     names = {node["executable"] for node in ours}
     assert names == set(NODES) - (set() if "simulated" in file.name else {"sim_workcell"})
     for node in ours:
-        files, given = node["parameters"]
-        assert shared_path(files) == REPOSITORY / f"config/{node['executable']}.yaml"
+        (given,) = [part for part in node["parameters"] if isinstance(part, dict)]
+        assert shared_path(node["parameters"][0]) == REPOSITORY / f"config/{node['executable']}.yaml"
         known = parameters_of(node["executable"])
         assert set(given) <= set(known), node["executable"]
         assert given["use_sim_time"] is ("simulated" in file.name)
     foreign = {entity.named["package"] for entity in entities if kind(entity) == "Node"} - {"sctn_nodes"}
     depends = re.findall(r"<exec_depend>(.*)</exec_depend>", (PACKAGE / "package.xml").read_text())
     assert foreign <= set(depends)
+
+
+def test_on_a_real_cell_a_file_of_the_engineer_wins_and_a_stop_is_remembered(launch_modules) -> None:
+    entities = description(PACKAGE / "launch/real_cell.launch.py")
+    nodes = {entity.named["executable"]: entity.named for entity in entities if kind(entity) == "Node"}
+    for name in set(NODES) - {"sim_workcell"}:
+        _, real_cell, _, of_engineer = nodes[name]["parameters"]
+        assert shared_path(real_cell) == REPOSITORY / "config/real_cell.yaml"
+        assert (kind(of_engineer), of_engineer.values) == ("LaunchConfiguration", ("parameters",))
+    given = nodes["suction_executor"]["parameters"][2]
+    asked = {name: value.values[0] for name, value in given.items() if kind(value) == "LaunchConfiguration"}
+    assert asked == {name: name for name in ("urdf", "arm_calibration", "stop_file")}
+    defaults = {entity.values[0]: entity.named["default_value"] for entity in entities if kind(entity) == "DeclareLaunchArgument"}
+    home, *path = defaults["stop_file"]
+    assert (kind(home), home.values) == ("EnvironmentVariable", ("ROS_HOME",))
+    # Two cells on one host, in two namespaces, have two files.
+    assert any(kind(part) == "LaunchConfiguration" and part.values == ("namespace",) for part in path)
+    # The file that is read where the engineer names none is one that is read before, too.
+    assert shared_path(defaults["parameters"]) == REPOSITORY / "config/real_cell.yaml"
 
 
 def interface_page() -> str:

@@ -14,7 +14,10 @@ import pytest
 from builtin_interfaces.msg import Time
 from cell_operator import LATCHED, Operator, nanoseconds
 from geometry_msgs.msg import Point, Pose2D
+from processes import free_domain
+from rcl_interfaces.srv import SetParameters
 from rclpy.duration import Duration
+from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
 from sctn_msgs.msg import Heightmap, PickPlace, PrimitiveSettings, StepConfirmation, StepResult
 from std_msgs.msg import Header
@@ -283,3 +286,35 @@ def test_a_proposal_from_before_the_last_motion_moves_nothing(cell: Cell) -> Non
     proposal = cell.propose(heightmap)
     assert cell.decide(proposal.id).duration.sec > 0
     refused(cell, cell.decide(cell.propose(heightmap).id), "before the last motion")
+
+
+def test_nobody_on_the_network_weakens_what_the_executor_asks_for(start) -> None:
+    domain = free_domain()
+    start("sim_workcell", "--ros-args", "-p", "problem:=placing", "-p", "seed:=10000", domain=domain)
+    start("suction_executor", "--ros-args", "-p", "use_sim_time:=true", "-p", "require_approval:=unsure", domain=domain)
+    with Operator(domain) as operator:
+        cell = Cell(operator)
+        cell.wait_until_ready()
+        client = operator.node.create_client(SetParameters, "suction_executor/set_parameters")
+        operator.until(client.service_is_ready, "parameters of the executor", 30.0)
+        weaker = {
+            "require_approval": "never",
+            "sure_probability": 0.0,
+            "presence_timeout_s": 1000.0,
+            "stop_file": "/dev/null",
+            "limits.travel_m_s": 9.0,
+            "joints.acceleration_rad_s2": 99.0,
+            "observation_changed_area_mm2": 1e6,
+            "observation_max_age_s": 1000.0,
+            "collision_margin_m": 0.0,
+            "driver.enable_pin": 3,
+            "driver.status_max_age_s": 1000.0,
+        }
+        request = SetParameters.Request(parameters=[Parameter(name, value=value).to_parameter_msg() for name, value in weaker.items()])
+        answer = client.call_async(request)
+        operator.until(answer.done, "answer of the executor", 30.0)
+        for name, result in zip(weaker, answer.result().results, strict=True):
+            assert not result.successful and f"{name} is read when the node is started" in result.reason, result
+        # It is not sure to succeed, and nobody is asked.
+        cell.propose(cell.observe(), lambda proposal: setattr(proposal, "success_probability", 0.5))
+        cell.assert_still()

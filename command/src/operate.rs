@@ -152,6 +152,8 @@ struct Desk {
     name: String,
     approve_only: bool,
     proposals: Subscription<PickPlace>,
+    /// Proposals that came as goals of the executor's action.
+    accepted: Subscription<PickPlace>,
     planned: Subscription<PlannedMotion>,
     results: Subscription<StepResult>,
     refused: Subscription<ConfirmationRefused>,
@@ -185,6 +187,7 @@ impl Desk {
                 .unwrap_or_else(|| "sctn operate".into()),
             approve_only: given.approve_only,
             proposals: node.subscription("pick_place", Qos::Latched)?,
+            accepted: node.subscription("pick_place_goal", Qos::Event)?,
             planned: node.subscription("planned_motion", Qos::Latched)?,
             results: node.subscription("step_result", Qos::Event)?,
             refused: node.subscription("confirmation_refused", Qos::Event)?,
@@ -212,6 +215,13 @@ impl Desk {
                 Ok(proposal) => self.operator.on_proposal(proposal),
                 Err(error) => {
                     self.proposals.reject(error);
+                    None
+                }
+            },
+            message = self.accepted.recv() => match convert::proposal_from_msg(&message) {
+                Ok(proposal) => self.operator.on_proposal(proposal),
+                Err(error) => {
+                    self.accepted.reject(error);
                     None
                 }
             },

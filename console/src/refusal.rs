@@ -76,7 +76,7 @@ const ADVICE: [(&str, &str); 16] = [
     ),
     (
         "safety mode",
-        "Look at the teach pendant: unlock the protective stop when it is safe.",
+        "Look at the teach pendant: release the emergency or safeguard stop, or unlock the protective stop, when it is safe.",
     ),
     (
         "robot program",

@@ -1,6 +1,9 @@
 """The graph on a real cell: beside the drivers of the UR5 and of the cameras, which have to run already.
 
-ros2 launch sctn_nodes real_cell.launch.py demonstration:=/path/to/bag calibration:=/path/to/calibration.yaml
+ros2 launch sctn_nodes real_cell.launch.py urdf:=/path/to/cell.urdf arm_calibration:=/path/to/my_robot_calibration.yaml \\
+    calibration:=/path/to/calibration.yaml parameters:=/path/to/my_cell.yaml demonstration:=/path/to/bag
+
+Each node reads its file in config/, then config/real_cell.yaml, then the file that `parameters` names.
 
 The UR driver: `ros2 launch ur_robot_driver ur_control.launch.py ur_type:=ur5 robot_ip:=...`. It publishes joint_states, tf and
 robot_description of the arm. Where nothing tells where the work cell's other frames are, publish_cell:=true has robot_state_publisher
@@ -10,7 +13,7 @@ tell what urdf/workcell.urdf says; not together with the driver's own, or the ar
 from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument
 from launch.conditions import IfCondition
-from launch.substitutions import Command, LaunchConfiguration, PathJoinSubstitution
+from launch.substitutions import Command, EnvironmentVariable, LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
 from launch_ros.substitutions import FindPackageShare
@@ -25,7 +28,12 @@ def generate_launch_description() -> LaunchDescription:
             package="sctn_nodes",
             executable=executable,
             namespace=LaunchConfiguration("namespace"),
-            parameters=[share("config", f"{executable}.yaml"), {"use_sim_time": False, **parameters}],
+            parameters=[
+                share("config", f"{executable}.yaml"),
+                share("config", "real_cell.yaml"),
+                {"use_sim_time": False, **parameters},
+                LaunchConfiguration("parameters"),
+            ],
             condition=condition,
             output="screen",
         )
@@ -48,7 +56,27 @@ def generate_launch_description() -> LaunchDescription:
                 default_value="",
                 description="Poses of the cameras, as config/calibration.yaml explains; empty: from /tf_static.",
             ),
-            DeclareLaunchArgument("urdf", default_value=share("urdf", "workcell.urdf"), description="The work cell, calibrated."),
+            DeclareLaunchArgument("urdf", default_value=share("urdf", "workcell.urdf"), description="The work cell."),
+            DeclareLaunchArgument(
+                "arm_calibration",
+                default_value="",
+                description="Factory calibration of the arm, as the UR driver's ur_calibration writes it; empty: as the URDF says.",
+            ),
+            DeclareLaunchArgument(
+                "parameters",
+                default_value=share("config", "real_cell.yaml"),
+                description="File of what is different on this cell, laid out as config/real_cell.yaml; it wins over all others.",
+            ),
+            DeclareLaunchArgument(
+                "stop_file",
+                default_value=[
+                    EnvironmentVariable("ROS_HOME", default_value=[EnvironmentVariable("HOME"), "/.ros"]),
+                    "/sctn/",
+                    LaunchConfiguration("namespace"),
+                    "/stopped",
+                ],
+                description="Where the executor remembers a stop over a restart; one file for each cell.",
+            ),
             DeclareLaunchArgument(
                 "contact",
                 default_value="until_action",
@@ -64,16 +92,13 @@ def generate_launch_description() -> LaunchDescription:
                 "gctn_policy",
                 checkpoint=LaunchConfiguration("checkpoint"),
                 urdf=LaunchConfiguration("urdf"),
-                observation_needs_home=True,
             ),
-            # Time of the wall clock; the tip slows down above what was seen, and what the driver says may not be old.
             node(
                 "suction_executor",
                 urdf=LaunchConfiguration("urdf"),
-                observation_max_age_s=1.0,
-                observation_needs_home=True,
-                contact={"slow_from_m": 0.03},
-                driver={"contact": LaunchConfiguration("contact"), "status_max_age_s": 0.2},
+                arm_calibration=LaunchConfiguration("arm_calibration"),
+                stop_file=LaunchConfiguration("stop_file"),
+                driver={"contact": LaunchConfiguration("contact")},
             ),
             node("motion_watchdog"),
             node(

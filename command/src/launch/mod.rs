@@ -369,6 +369,8 @@ struct Desk {
     /// Whether the last goal is said to be reached.
     goals_reached: bool,
     proposals: node_kit::Subscription<PickPlace>,
+    /// Proposals that came as goals of the executor's action.
+    accepted: node_kit::Subscription<PickPlace>,
     results: node_kit::Subscription<StepResult>,
     refused: node_kit::Subscription<ConfirmationRefused>,
     rewards: node_kit::Subscription<Reward>,
@@ -398,6 +400,7 @@ impl Desk {
             asks_below,
             goals_reached: false,
             proposals: node.subscription("pick_place", Qos::Latched)?,
+            accepted: node.subscription("pick_place_goal", Qos::Event)?,
             results: node.subscription(results, Qos::Event)?,
             refused: node.subscription("confirmation_refused", Qos::Event)?,
             rewards: node.subscription("reward", Qos::Event)?,
@@ -439,6 +442,10 @@ impl Desk {
                 message = self.proposals.recv() => match convert::proposal_from_msg(&message) {
                     Ok(proposal) => questions.extend(self.operator.on_proposal(proposal)),
                     Err(error) => self.proposals.reject(error),
+                },
+                message = self.accepted.recv() => match convert::proposal_from_msg(&message) {
+                    Ok(proposal) => questions.extend(self.operator.on_proposal(proposal)),
+                    Err(error) => self.accepted.reject(error),
                 },
                 message = self.results.recv() => questions.extend(self.result(kind, &message)?),
                 message = self.rewards.recv() => match convert::reward_from_msg(&message) {

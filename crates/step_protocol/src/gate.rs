@@ -441,11 +441,6 @@ impl ApprovalGate {
         }
     }
 
-    /// From the next confirmation on.
-    pub fn set_rules(&mut self, rules: GateRules) {
-        self.rules = rules;
-    }
-
     /// Nothing moves by itself before the next approval: a stop or fault came before this gate was made.
     pub fn remember_stop(&mut self) {
         self.automatic = false;

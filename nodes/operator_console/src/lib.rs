@@ -32,7 +32,7 @@ use msgs::sensor_msgs::{Image, JointState};
 use msgs::std_msgs::{self, Bool, Float64};
 use msgs::ur_dashboard_msgs::{RobotMode, SafetyMode};
 use msgs::ur_msgs::IOStates;
-use node_kit::{Active, Level, Node, Qos};
+use node_kit::{Active, Level, Node, Qos, Subscription};
 use tokio::time::MissedTickBehavior;
 use tokio_util::sync::CancellationToken;
 use tracing::{info, warn};
@@ -135,6 +135,7 @@ impl Active for ConsoleNode {
         let mut heightmaps = node.subscription::<Heightmap>("heightmap", Qos::Latched)?;
         let mut goals = node.subscription::<Goal>("goal", Qos::Latched)?;
         let mut proposals = node.subscription::<PickPlace>("pick_place", Qos::Latched)?;
+        let mut accepted = node.subscription::<PickPlace>("pick_place_goal", Qos::Event)?;
         let mut confirmations =
             node.subscription::<StepConfirmation>("step_confirmation", Qos::Event)?;
         let mut results = node.subscription::<StepResult>("step_result", Qos::Event)?;
@@ -176,14 +177,8 @@ impl Active for ConsoleNode {
                         goals.reject(error);
                     }
                 }
-                message = proposals.recv() => {
-                    let proposal = proposal_from_msg(&message).map_err(anyhow::Error::from);
-                    let shown = proposal
-                        .and_then(|proposal| Ok(console.change(|state, now| state.on_proposal(proposal, now))?));
-                    if let Err(error) = shown {
-                        proposals.reject(error);
-                    }
-                }
+                message = proposals.recv() => show_proposal(&console, &proposals, &message),
+                message = accepted.recv() => show_proposal(&console, &accepted, &message),
                 message = confirmations.recv() => match confirmation_from_msg(&message) {
                     Ok(confirmation) => console.change(|state, now| state.on_confirmation(&confirmation, now)),
                     Err(refusal) => confirmations.reject(refusal),
@@ -257,6 +252,16 @@ impl Active for ConsoleNode {
                 }
             }
         }
+    }
+}
+
+/// Viewers see a proposal, of a topic or of the executor's action.
+fn show_proposal(console: &Console, topic: &Subscription<PickPlace>, message: &PickPlace) {
+    let proposal = proposal_from_msg(message).map_err(anyhow::Error::from);
+    let shown = proposal
+        .and_then(|proposal| Ok(console.change(|state, now| state.on_proposal(proposal, now))?));
+    if let Err(error) = shown {
+        topic.reject(error);
     }
 }
 

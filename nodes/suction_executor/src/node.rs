@@ -8,7 +8,6 @@ mod proposals;
 mod rehearsals;
 mod report;
 
-use std::path::Path;
 use std::sync::Arc;
 use std::time::{Duration, Instant};
 
@@ -30,6 +29,7 @@ use ur5::WorkCell;
 use self::action::{Goal, cancel_of};
 use self::motion::{Motion, end_of};
 use self::rehearsals::Rehearsals;
+use crate::cell;
 use crate::parameters::SuctionExecutorParameters;
 use crate::stop_memory::StopMemory;
 
@@ -47,11 +47,7 @@ pub async fn configure(
     parameters: SuctionExecutorParameters,
 ) -> anyhow::Result<ExecutorNode> {
     ur_driver::planted::check()?;
-    let work_cell = match parameters.urdf.as_path() {
-        path if path == Path::new("") => WorkCell::builtin(),
-        path => WorkCell::load(path),
-    }
-    .context("parameter urdf")?;
+    let work_cell = cell::load(&parameters)?;
     if let Some(warning) = work_cell.warning() {
         warn!("parameter urdf: {warning}");
     }
@@ -63,19 +59,23 @@ pub async fn configure(
         CollisionChecker::new(&work_cell, margins).context("parameter collision_margin_m")?;
     let driver = DriverClient::new(&node, &parameters.driver, &work_cell)?;
     let mut gate = ApprovalGate::new(rules(&parameters));
-    let stop_memory = StopMemory::new(parameters.stop_file.clone());
-    if let Some(reason) = stop_memory.recall().context("parameter stop_file")? {
+    let stop_file = &parameters.stop_file;
+    let stop_memory = StopMemory::open(stop_file)
+        .with_context(|| format!("parameter stop_file: {}", stop_file.display()))?;
+    if let Some(reason) = stop_memory.stopped() {
         warn!("stopped before this start: {reason}. Nothing moves by itself before an approval");
         gate.remember_stop();
     }
     Ok(ExecutorNode {
         results: node.publisher("step_result", Qos::Event)?,
         planned: node.publisher("planned_motion", Qos::Latched)?,
+        accepted: node.publisher("pick_place_goal", Qos::Event)?,
         gate,
         stop_memory,
         driver: Arc::new(driver),
         work_cell,
         checker: Arc::new(checker),
+        parameters,
     })
 }
 
@@ -100,28 +100,29 @@ fn changes(parameters: &SuctionExecutorParameters) -> ChangeRules {
 pub struct ExecutorNode {
     results: Publisher<sctn_msgs::StepResult>,
     planned: Publisher<sctn_msgs::PlannedMotion>,
+    accepted: Publisher<sctn_msgs::PickPlace>,
     gate: ApprovalGate,
     stop_memory: StopMemory,
     driver: Arc<DriverClient>,
     work_cell: WorkCell,
     checker: Arc<CollisionChecker>,
+    parameters: SuctionExecutorParameters,
 }
 
 impl Active for ExecutorNode {
     async fn run(&mut self, node: &Node) -> anyhow::Result<()> {
         let _active = self.driver.heartbeat.activate(node).await?;
-        let parameters = node.parameters::<SuctionExecutorParameters>();
+        let parameters = self.parameters.clone();
         let (phase_sender, phases) = mpsc::unbounded_channel();
         let executor = Executor {
             proposals: node.subscription("pick_place", Qos::Latched)?,
             confirmations: node.subscription("step_confirmation", Qos::Event)?,
             heightmaps: node.subscription("heightmap", Qos::Latched)?,
             presences: node.subscription("operator_presence", Qos::Event)?,
-            presence: Presence::new(Duration::from_secs_f64(
-                parameters.borrow().presence_timeout_s,
-            )),
+            presence: Presence::new(Duration::from_secs_f64(parameters.presence_timeout_s)),
             results: &self.results,
             planned: &self.planned,
+            accepted: &self.accepted,
             rehearsals: Rehearsals::default(),
             home: node.service_server("~/propose_home")?,
             put_down: node.service_server("~/propose_put_down")?,
@@ -130,7 +131,7 @@ impl Active for ExecutorNode {
             phase_sender,
             phases,
             gate: &mut self.gate,
-            stop_memory: self.stop_memory.clone(),
+            stop_memory: &mut self.stop_memory,
             seen: None,
             has_publisher: false,
             without_arm: None,
@@ -140,13 +141,13 @@ impl Active for ExecutorNode {
             motion: None,
             driver: Arc::clone(&self.driver),
             node: node.clone(),
-            parameters: parameters.borrow().clone(),
+            parameters,
             work_cell: self.work_cell.clone(),
             checker: Arc::clone(&self.checker),
             status: self.driver.status.clone(),
             origin: self.driver.origin,
         };
-        executor.run(parameters).await
+        executor.run().await
     }
 }
 
@@ -162,6 +163,8 @@ struct Executor<'a> {
     presence: Presence,
     results: &'a Publisher<sctn_msgs::StepResult>,
     planned: &'a Publisher<sctn_msgs::PlannedMotion>,
+    /// Proposals that came as goals of the action.
+    accepted: &'a Publisher<sctn_msgs::PickPlace>,
     rehearsals: Rehearsals,
     home: ServiceServer<sctn_msgs::ProposeHome>,
     put_down: ServiceServer<sctn_msgs::ProposeHome>,
@@ -171,7 +174,7 @@ struct Executor<'a> {
     /// Phases of the motion under way.
     phases: mpsc::UnboundedReceiver<Phase>,
     gate: &'a mut ApprovalGate,
-    stop_memory: StopMemory,
+    stop_memory: &'a mut StopMemory,
     /// The newest heightmap and its stamp.
     seen: Option<(Arc<Heightmap>, Duration)>,
     /// Whether anybody was known to publish heightmaps.
@@ -189,10 +192,7 @@ struct Executor<'a> {
 }
 
 impl Executor<'_> {
-    async fn run(
-        mut self,
-        mut changes: watch::Receiver<SuctionExecutorParameters>,
-    ) -> anyhow::Result<()> {
+    async fn run(mut self) -> anyhow::Result<()> {
         let node = self.node.clone();
         let mut diagnostics = tokio::time::interval(DIAGNOSTICS_PERIOD);
         loop {
@@ -217,10 +217,6 @@ impl Executor<'_> {
                     #[cfg(feature = "planted_faults")]
                     self.plant_now_and_then();
                     self.rehearse_next();
-                }
-                Ok(()) = changes.changed() => {
-                    self.parameters = changes.borrow_and_update().clone();
-                    self.gate.set_rules(rules(&self.parameters));
                 }
                 () = node.deactivated() => break,
             }

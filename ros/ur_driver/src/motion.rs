@@ -115,7 +115,15 @@ impl DriverClient {
         if is_planted(Planted::AnswersWithoutCancel) {
             return reason;
         }
-        match self.stop_arm().await {
+        let stopped = self.stop_arm().await;
+        let reason = match (reason, self.status.borrow().safety_stop()) {
+            // The driver tells its modes one by one: the power that is off before the emergency stop that has switched it off.
+            (DriverError::Fault(reason), Some(stop)) if !reason.contains(&stop) => {
+                DriverError::Fault(format!("{stop}; {reason}"))
+            }
+            (reason, _) => reason,
+        };
+        match stopped {
             Ok(()) => {
                 info!("broken off, the arm rests: {reason}");
                 reason

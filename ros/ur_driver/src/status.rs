@@ -141,6 +141,13 @@ impl DriverStatus {
     /// of joint and pin states tell whether the driver is alive: neither may be older than
     /// `max_age`.
     pub fn obstacle(&self, now: Duration, max_age: Duration) -> Option<String> {
+        // The safety mode is why: an emergency stop switches the power off, too.
+        if let Some(stop) = self.safety_stop() {
+            return Some(stop);
+        }
+        if self.safety_mode.is_none() {
+            return Some("the driver has not published its safety mode".into());
+        }
         match self.robot_mode {
             Some(RUNNING) => {}
             Some(mode) => {
@@ -149,16 +156,6 @@ impl DriverStatus {
                 ));
             }
             None => return Some("the driver has not published its robot mode".into()),
-        }
-        match self.safety_mode {
-            Some(NORMAL | REDUCED) => {}
-            Some(mode) => {
-                return Some(format!(
-                    "safety mode is {}, expected NORMAL or REDUCED",
-                    safety_mode_name(mode)
-                ));
-            }
-            None => return Some("the driver has not published its safety mode".into()),
         }
         match self.program_running {
             Some(true) => {}
@@ -184,6 +181,17 @@ impl DriverStatus {
         }
         let disabled = self.pins.is_some_and(|pins| pins.value.disabled);
         disabled.then(|| "the enabling input is low (driver.enable_pin)".into())
+    }
+
+    /// The safety mode, where it is one in which the robot stops.
+    pub fn safety_stop(&self) -> Option<String> {
+        match self.safety_mode? {
+            NORMAL | REDUCED => None,
+            mode => Some(format!(
+                "safety mode is {}, expected NORMAL or REDUCED",
+                safety_mode_name(mode)
+            )),
+        }
     }
 
     /// Whether the enabling input is low, or has been since a time.
@@ -295,6 +303,15 @@ mod tests {
                     ..ready.clone()
                 },
                 "PROTECTIVE_STOP",
+            ),
+            // An emergency stop, and the power off with it.
+            (
+                DriverStatus {
+                    robot_mode: Some(3),
+                    safety_mode: Some(7),
+                    ..ready.clone()
+                },
+                "ROBOT_EMERGENCY_STOP",
             ),
             (
                 DriverStatus {

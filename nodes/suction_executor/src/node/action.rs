@@ -53,9 +53,12 @@ impl Executor<'_> {
             return;
         }
         info!("proposal {id}: a goal of the action");
+        let (goal, running) = new.accept();
+        // Before anything is asked about it or done for it.
+        self.accepted.publish(goal.proposal);
         self.goal = Some(Goal {
             id,
-            running: new.accept().1,
+            running,
             moving: false,
             cancelling: false,
         });

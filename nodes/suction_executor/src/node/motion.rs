@@ -50,7 +50,8 @@ pub(super) struct Ended {
 impl Executor<'_> {
     pub(super) fn begin(&mut self, proposal: Proposal) {
         info!("proposal {}: moving", proposal.id);
-        self.stop_memory.forget();
+        let motion = format!("the motion of proposal {}", proposal.id);
+        self.stop_memory.begin(&motion, true);
         if let Some(goal) = &mut self.goal {
             goal.moving = goal.id == proposal.id;
         }
@@ -104,6 +105,7 @@ impl Executor<'_> {
     /// Brings the arm home, straight up first; suction stays as it is.
     pub(super) fn begin_home(&mut self, id: ProposalId) {
         info!("proposal {id}: moving home");
+        self.stop_memory.begin("the way home", false);
         let arm = self.work_cell.arm.clone();
         self.start(MotionCause::Home(id), move |robot| {
             go_home(robot, &arm, &HOME_SETTINGS).map(|()| None)
@@ -113,6 +115,7 @@ impl Executor<'_> {
     /// Puts down what is held where it was picked, and brings the arm home.
     pub(super) fn begin_put_down(&mut self, id: ProposalId) {
         info!("proposal {id}: putting down what is held");
+        self.stop_memory.begin("putting down what is held", false);
         let arm = self.work_cell.arm.clone();
         // The gate has asked for it before.
         let what = self.robot().put_down();
@@ -177,6 +180,7 @@ impl Executor<'_> {
         if let Some(reason) = &broken_off {
             self.stop_memory.remember(reason);
         }
+        self.stop_memory.end();
         let level = match outcome {
             StepOutcome::Fault => Level::Error,
             _ => Level::Ok,

@@ -23,8 +23,8 @@ use step_protocol::{ApprovalGate, GateRules, Presence, Recovery, StopCause};
 use tokio::sync::{mpsc, watch};
 use tokio::time::timeout_at;
 use tracing::warn;
-use ur_driver::DriverClient;
 use ur_driver::status::DriverStatus;
+use ur_driver::{ActivateError, ActiveExecutor, DriverClient};
 use ur5::WorkCell;
 
 use self::action::{Goal, cancel_of};
@@ -109,7 +109,7 @@ pub struct ExecutorNode {
 
 impl Active for ExecutorNode {
     async fn run(&mut self, node: &Node) -> anyhow::Result<()> {
-        let _active = self.driver.heartbeat.activate(node).await?;
+        let active = self.driver.activate(node).await?;
         let parameters = node.parameters::<SuctionExecutorParameters>();
         let (phase_sender, phases) = mpsc::unbounded_channel();
         let executor = Executor {
@@ -146,7 +146,7 @@ impl Active for ExecutorNode {
             status: self.driver.status.clone(),
             origin: self.driver.origin,
         };
-        executor.run(parameters).await
+        executor.run(parameters, &active).await
     }
 }
 
@@ -192,8 +192,10 @@ impl Executor<'_> {
     async fn run(
         mut self,
         mut changes: watch::Receiver<SuctionExecutorParameters>,
+        active: &ActiveExecutor,
     ) -> anyhow::Result<()> {
         let node = self.node.clone();
+        let mut is_deposed = false;
         let mut diagnostics = tokio::time::interval(DIAGNOSTICS_PERIOD);
         loop {
             let deadline = self.gate.deadline().map(|deadline| self.origin + deadline);
@@ -222,6 +224,10 @@ impl Executor<'_> {
                     self.parameters = changes.borrow_and_update().clone();
                     self.gate.set_rules(rules(&self.parameters));
                 }
+                () = active.deposed() => {
+                    is_deposed = true;
+                    break;
+                }
                 () = node.deactivated() => break,
             }
         }
@@ -249,6 +255,9 @@ impl Executor<'_> {
         let quiet = timeout_at(deadline, self.driver.heartbeat.quiet()).await;
         if quiet.is_err() {
             warn!("the driver has not answered a goal");
+        }
+        if is_deposed {
+            return Err(ActivateError::AnotherIsActive.into());
         }
         Ok(())
     }

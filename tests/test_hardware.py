@@ -22,8 +22,8 @@ from test_refusals import Cell
 from ur_msgs.msg import IOStates
 from whole_run import parameters
 
-# Problems, and how many motions each may take: every step may be tried again a few times, the policy is learned.
-WHOLE_RUNS = {"placing": 3 * 9, "stacking": 3 * 6}
+# Problems, signs of contact, and how many motions each may take: every step may be tried again a few times, the policy is learned.
+WHOLE_RUNS = {("placing", "until_action"): 3 * 9, ("stacking", "until_action"): 3 * 6, ("placing", "height"): 3 * 9}
 # A disk of placing with seed 10000.
 DISK, DISK_RADIUS_M, DISK_HEIGHT_M = Pose2D(x=0.4354, y=0.1635, theta=0.0), 0.028, 0.012
 VACUUM_PIN = 16
@@ -34,14 +34,15 @@ REST_AFTER_DEATH_S = 0.6
 
 
 @pytest.fixture(scope="module", autouse=True)
-def whole_runs(request: pytest.FixtureRequest) -> Iterator[dict[str, subprocess.Popen[str]]]:
+def whole_runs(request: pytest.FixtureRequest) -> Iterator[dict[tuple[str, str], subprocess.Popen[str]]]:
     """The whole runs that are asked for, begun before the first test of this file: they take real time, and little of the processor."""
     whole_run = test_a_whole_run_completes_with_a_driver_as_it_is
-    asked_for = [item.callspec.params["problem"] for item in request.session.items if item.originalname == whole_run.__name__]
+    asked_for = [item.callspec.params for item in request.session.items if item.originalname == whole_run.__name__]
     runs = {}
-    for problem in asked_for:
-        command = [sys.executable, REPOSITORY / "tests/whole_run.py", problem, "10000", str(WHOLE_RUNS[problem])]
-        runs[problem] = subprocess.Popen(
+    for run in ((params["problem"], params["contact"]) for params in asked_for):
+        problem, contact = run
+        command = [sys.executable, REPOSITORY / "tests/whole_run.py", problem, "10000", str(WHOLE_RUNS[run]), contact]
+        runs[run] = subprocess.Popen(
             command, cwd=REPOSITORY / "tests", stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
         )
     try:
@@ -247,6 +248,18 @@ def test_a_second_executor_does_not_become_active(cell: Cell, start) -> None:
     wait_until_moving(cell)
 
 
+def test_of_two_executors_that_start_at_the_same_time_one_works(start, operator: Operator) -> None:
+    start("sim_workcell", *parameters("sim_workcell", seed=10000))
+    cell = Cell(operator)
+    both = [start("suction_executor", *parameters("suction_executor")) for _ in range(2)]
+    operator.until(lambda: any(executor.exit_code is not None for executor in both), "executor that gives way", 30.0)
+    (gone,) = [executor for executor in both if executor.exit_code is not None]
+    assert gone.exit_code != 0 and "another executor is active" in gone.errors()
+    cell.wait_until_ready()
+    cell.operator.confirm(propose(cell).id, StepConfirmation.APPROVE)
+    wait_until_moving(cell)
+
+
 def test_the_way_home_moves_only_by_an_approval_of_that_very_proposal(cell: Cell) -> None:
     client = cell.operator.node.create_client(ProposeHome, "suction_executor/propose_home")
 
@@ -381,10 +394,32 @@ def test_an_approval_counts_only_while_somebody_publishes_heightmaps(start, oper
     assert rest_after(cell, 1.0) == 0.0
 
 
-@pytest.mark.parametrize("problem", WHOLE_RUNS)
-def test_a_whole_run_completes_with_a_driver_as_it_is(whole_runs: dict[str, subprocess.Popen[str]], problem: str) -> None:
-    output, log = whole_runs[problem].communicate(timeout=600.0)
+def test_an_object_that_is_lost_in_mid_air_ends_as_dropped_with_the_arm_at_home(start, operator: Operator) -> None:
+    # Lost on the transfer, which takes 3 s at 0.1 m/s.
+    start("sim_workcell", *parameters("sim_workcell", seed=10000, hardware__vacuum_leak_s=3.0))
+    cell = Cell(operator)
+    start("suction_executor", *parameters("suction_executor"))
+    cell.wait_until_ready()
+    home = np.array(operator.newest("joint_states").position)
+
+    def pick_the_disk(proposal: PickPlace) -> None:
+        proposal.pick, proposal.place = DISK, Pose2D(x=0.5, y=-0.2, theta=0.0)
+        proposal.settings.lift_m, proposal.settings.carry_m_s = 0.05, 0.1
+
+    proposal = cell.propose(cell.observe(look_at_disk(cell)), pick_the_disk)
+    result = cell.decide(proposal.id)
+    assert result.outcome == StepResult.DROPPED, result
+    assert np.abs(np.array(operator.newest("joint_states").position) - home).max() < 1e-2
+    # It is over: nothing goes on by itself.
+    assert rest_after(cell, 1.0) == 0.0
+
+
+@pytest.mark.parametrize(("problem", "contact"), WHOLE_RUNS)
+def test_a_whole_run_completes_with_a_driver_as_it_is(
+    whole_runs: dict[tuple[str, str], subprocess.Popen[str]], problem: str, contact: str
+) -> None:
+    output, log = whole_runs[problem, contact].communicate(timeout=600.0)
     assert output, log
     result = json.loads(output)
-    print(f"{problem}: {len(result['outcomes'])} motions in {result['took_s']} s, total reward {result['total_reward']:.3f}")
+    print(f"{problem} ({contact}): {len(result['outcomes'])} motions in {result['took_s']} s, total reward {result['total_reward']:.3f}")
     assert result["complete"], (result, log)

@@ -1,4 +1,6 @@
-"""A whole run with a driver as it is: whole_run.py PROBLEM SEED MOST_PROPOSALS.
+"""A whole run with a driver as it is: whole_run.py PROBLEM SEED MOST_PROPOSALS [CONTACT].
+
+CONTACT: the executor's `driver.contact`; with `height` the robot is a CB3, whose driver has neither tool contact nor `trajectory_until_node`.
 
 Prints its result as a line of JSON, and where it is not complete the logs on standard error.
 Everything happens in real time: a disk takes some 10 s, of which the driver takes 3 s to accept two descents.
@@ -72,6 +74,10 @@ def main() -> None:
     # What was started is ended then too.
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))
     problem, seed, most_proposals = sys.argv[1], int(sys.argv[2]), int(sys.argv[3])
+    contact = sys.argv[4] if len(sys.argv) > 4 else "until_action"
+    robot = {"hardware__software_major": 3} if contact == "height" else {}
+    # A robot that senses no contact is sure to touch what it is to grip only where it goes a little further.
+    sign = {"driver__contact": contact} | ({"contact__press_m": 0.003} if contact == "height" else {})
     domain = free_domain()
     with tempfile.TemporaryDirectory() as folder, contextlib.ExitStack() as stack:
         logs = pathlib.Path(folder)
@@ -87,11 +93,11 @@ def main() -> None:
             sys.exit(demos.log())
         (demonstration,) = [file.parent for file in (logs / "demos").rglob("metadata.yaml")]
         operator = stack.enter_context(Operator(domain))
-        start("sim_workcell", *parameters("sim_workcell", problem=problem, seed=seed))
+        start("sim_workcell", *parameters("sim_workcell", problem=problem, seed=seed, **robot))
         start("camera_fusion", *parameters("camera_fusion"))
         start("goal_oracle", *parameters("goal_oracle", demonstration=demonstration))
         start("gctn_policy", *parameters("gctn_policy", checkpoint=CHECKPOINT))
-        start("suction_executor", *parameters("suction_executor"))
+        start("suction_executor", *parameters("suction_executor", **sign))
         operator.listeners = 3
         begin = time.monotonic()
         try:

@@ -6,7 +6,7 @@ use collision::{
 };
 use heightmap::{Heightmap, Workspace};
 use nalgebra::{Isometry2, Isometry3, Point2, Point3, Vector2, Vector3};
-use pick_place::{PickPlace, PrimitiveSettings, Robot, Touchdown};
+use pick_place::{Outcome, PickPlace, PrimitiveSettings, Robot, Touchdown};
 use proptest::prelude::*;
 use std::convert::Infallible;
 use ur5::{Arm, JointTrajectory, Joints, Shape, WorkCell};
@@ -619,4 +619,104 @@ fn a_low_way_over_a_cable_is_refused_also_where_nothing_is_seen_that_would_be_ca
     );
     rehearsed(&cable, 0.05).unwrap();
     rehearsed(&empty_table(), 0.012).unwrap();
+}
+
+/// The built-in cell with a ball of 20 mm that hangs in the air.
+fn cell_with_ball(at: Vector3<f64>) -> WorkCell {
+    let ball = format!(
+        "<link name=\"ball\"><collision><geometry><sphere radius=\"0.02\"/></geometry></collision></link>\
+        <joint name=\"world-ball\" type=\"fixed\"><parent link=\"world\"/><child link=\"ball\"/>\
+        <origin xyz=\"{} {} {}\" rpy=\"0 0 0\"/></joint></robot>",
+        at.x, at.y, at.z
+    );
+    WorkCell::parse(&cell().urdf.replace("</robot>", &ball), "cell.urdf").unwrap()
+}
+
+#[test]
+fn what_only_a_way_home_after_a_failure_would_hit_is_refused_and_named() {
+    let arm = &cell().arm;
+    let pose = |y_m| Isometry2::new(Vector2::new(0.5, y_m), 0.0);
+    let action = PickPlace {
+        pick: pose(-0.25),
+        place: pose(0.25),
+    };
+    // Lifted higher than the clearance, so that each failure is noticed where nothing else leads home from.
+    let settings = PrimitiveSettings {
+        clearance_m: 0.15,
+        lift_m: 0.3,
+        ..PrimitiveSettings::RIGID
+    };
+    let over = |pose: &Isometry2<f64>, height_m| {
+        let above = Arm::tip_down(pose, height_m);
+        arm.solve(&above, &arm.ready).unwrap()
+    };
+    let (pick, place) = action.tips();
+    for (ends, start, from, reason) in [
+        (
+            Outcome::NoContact,
+            over(&place, 0.3),
+            over(&pick, 0.15),
+            "if there is nothing to pick: Home",
+        ),
+        (
+            Outcome::GraspFailed,
+            arm.home,
+            over(&pick, 0.3),
+            "if suction holds nothing: Home",
+        ),
+        (
+            Outcome::Dropped,
+            arm.home,
+            over(&place, 0.3),
+            "if the object is lost on its way: Home",
+        ),
+    ] {
+        let way = JointTrajectory::joint_space(arm, &from, &arm.home).unwrap();
+        let refused = (1..10).filter_map(|tenth| {
+            let joints = way.sample(way.duration() * tenth / 10);
+            let with_ball = cell_with_ball(arm.tip(&joints).translation.vector);
+            let situation = Situation {
+                joints: &start,
+                holds: false,
+                heightmap: Some(&empty_table()),
+                touchdown: None,
+            };
+            let checker = checker(&with_ball);
+            rehearse(&checker, arm, &action, &settings, &situation).err()
+        });
+        let refused: Vec<_> = refused.collect();
+        // Some of the balls are in the way of what is expected, too; that is looked at first.
+        let found = refused.iter().find(|refused| refused.ends == ends);
+        let found = found.unwrap_or_else(|| panic!("{ends:?}: {refused:#?}"));
+        let text = found.to_string();
+        assert!(text.starts_with(reason) && text.contains("ball"), "{text}");
+    }
+}
+
+#[test]
+fn the_ways_home_after_a_failure_cost_little() {
+    let cell = cell();
+    let checker = checker(&cell);
+    let (heightmap, action) = block_beside_a_wall(0.1, 0.0);
+    let (arm, settings) = (&cell.arm, PrimitiveSettings::BEADS);
+    let situation = Situation {
+        joints: &arm.home,
+        holds: false,
+        heightmap: Some(&heightmap),
+        touchdown: None,
+    };
+    let (outcome, clearance) = rehearse(&checker, arm, &action, &settings, &situation).unwrap();
+    assert_eq!(outcome, Outcome::Placed);
+    // What is expected alone.
+    let motions = motions(arm, &action, &settings).unwrap();
+    let samples = |motion: &JointTrajectory| {
+        let found = checker.check(motion, &Scene::default());
+        found.map_or(0, |found| found.samples)
+    };
+    let expected: usize = motions.iter().map(|(motion, _)| samples(motion)).sum();
+    println!(
+        "{} samples, {expected} for what is expected",
+        clearance.samples
+    );
+    assert!(clearance.samples < 2 * expected, "{expected} {clearance:?}");
 }

@@ -124,6 +124,11 @@ pub enum PrimitiveError {
         height_m: f64,
         highest_m: f64,
     },
+    /// What is held met nothing where contact was expected.
+    #[error(
+        "{phase:?}: no contact down to a height of {height_m:.4} m, which ends the window in which it is expected: what is held stays held"
+    )]
+    MissedContact { phase: Phase, height_m: f64 },
     /// A report that does not answer the last command.
     #[error("{phase:?}: {report:?} does not answer the last command")]
     UnexpectedReport { phase: Phase, report: Report },
@@ -358,14 +363,25 @@ impl<'a> Primitive<'a> {
                 self.phase = Phase::DescendToPlace;
                 self.begin_descent()?
             }
-            (Phase::DescendToPlace, Report::Contact(_) | Report::NoContact(_)) => {
-                if let Report::Contact(_) = report {
-                    self.check_contact()?;
-                }
+            (Phase::DescendToPlace, Report::Contact(_)) => {
+                self.check_contact()?;
                 self.phase = Phase::Release;
                 Command::ReadVacuum
             }
-            (Phase::Transfer | Phase::Release, Report::Holds(false)) => {
+            (Phase::DescendToPlace, Report::NoContact(_)) => {
+                if self.window().is_none() {
+                    self.phase = Phase::Release;
+                }
+                Command::ReadVacuum
+            }
+            // Down to the end of the window, and still in the air: it would fall.
+            (Phase::DescendToPlace, Report::Holds(true)) => {
+                return Err(PrimitiveError::MissedContact {
+                    phase: self.phase,
+                    height_m: self.height_m(),
+                });
+            }
+            (Phase::Transfer | Phase::DescendToPlace | Phase::Release, Report::Holds(false)) => {
                 self.give_up(Outcome::Dropped)
             }
             (Phase::Release, Report::Holds(true)) => Command::SetSuction(false),
@@ -481,9 +497,14 @@ impl<'a> Primitive<'a> {
             .map(Command::FollowUntilContact)
     }
 
+    /// Where the contact of the descent under way is expected, and sensed.
+    fn window(&self) -> Option<Touchdown> {
+        self.touchdown.filter(|touchdown| self.senses(touchdown))
+    }
+
     /// Refuses contact above the surface that was seen.
     fn check_contact(&self) -> Result<(), PrimitiveError> {
-        let Some(touchdown) = self.touchdown.filter(|touchdown| self.senses(touchdown)) else {
+        let Some(touchdown) = self.window() else {
             return Ok(());
         };
         let (height_m, highest_m) = (

@@ -19,7 +19,7 @@ pub struct PutDown {
     pub slow_from_m: f64,
     /// Speed of the tip from there on (m/s).
     pub slow_m_s: f64,
-    /// Contact higher than expected by more is a fault; the descent ends so far below (m).
+    /// Contact higher than expected by more is a fault, and so is none down to so far below, where the descent ends (m).
     pub window_m: f64,
     /// Whether the robot senses contact of what it holds. Where it does not, the expected height is taken for it.
     pub senses: bool,
@@ -54,7 +54,7 @@ impl PutDown {
 /// at the pick where `at` is the pose of the tip at the pick: then the object stands as it stood.
 ///
 /// # Errors
-/// Returns at once, without another command to the robot; nothing is held, or contact came where nothing was expected.
+/// Returns at once, without another command to the robot; nothing is held, contact came where nothing was expected, or none where it was.
 pub fn put_down<R: Robot>(
     robot: &mut R,
     arm: &Arm,
@@ -119,6 +119,9 @@ pub fn put_down<R: Robot>(
             highest_m,
         }
         .into());
+    }
+    if !touched && what.senses {
+        return Err(PrimitiveError::MissedContact { phase, height_m }.into());
     }
     let phase = Phase::Release;
     robot.set_suction(false).map_err(robot_error(phase))?;

@@ -130,7 +130,11 @@ pub(crate) fn rise_of<R: Robot>(
     Ok(())
 }
 
-fn carry_out<R: Robot>(robot: &mut R, command: &Command) -> Result<Report, R::Error> {
+/// Has a robot carry out one command of a primitive, and says what the primitive hears of it.
+///
+/// # Errors
+/// The robot did not do what it was told.
+pub fn carry_out<R: Robot>(robot: &mut R, command: &Command) -> Result<Report, R::Error> {
     Ok(match command {
         Command::Follow(trajectory) => match robot.follow(trajectory)? {
             true => Report::Arrived(robot.joints()?),

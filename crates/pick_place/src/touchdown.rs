@@ -25,7 +25,8 @@ pub struct ContactSettings {
     pub slow_from_m: f64,
     /// Speed of the tip from there on (m/s).
     pub slow_m_s: f64,
-    /// Contact higher than expected by more is a fault, and a descent ends so far below the surface (m).
+    /// Contact higher than expected by more is a fault, and a descent ends so far below the surface (m). What is held is never let go there
+    /// without contact, where that is sensed.
     pub window_m: f64,
     /// The cup is pressed on by so much after contact (m).
     pub press_m: f64,

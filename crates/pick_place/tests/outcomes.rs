@@ -515,7 +515,7 @@ fn after_a_fault_what_is_held_is_put_down_where_it_was_picked() {
 }
 
 #[test]
-fn nothing_is_put_down_that_is_not_held_or_meets_something_too_early() {
+fn nothing_is_put_down_that_is_not_held_or_meets_something_too_early_or_nothing() {
     let arm = WorkCell::builtin().unwrap().arm;
     let mut robot = ScriptedRobot::new();
     let error = put_down(&mut robot, &arm, &back(), &PrimitiveSettings::RIGID).unwrap_err();
@@ -540,6 +540,15 @@ fn nothing_is_put_down_that_is_not_held_or_meets_something_too_early() {
     assert!((0.059..=0.06).contains(&height_m), "{height_m}");
     assert!((highest_m - 0.055).abs() < 1e-9, "{highest_m}");
     // It holds what it held.
+    assert!(robot.suction);
+    // What stood under it is gone.
+    robot.descents = 0;
+    robot.contacts_m = [None; 2];
+    let error = put_down(&mut robot, &arm, &back(), &PrimitiveSettings::RIGID).unwrap_err();
+    assert!(
+        error.to_string().contains("DescendToPlace: no contact"),
+        "{error}"
+    );
     assert!(robot.suction);
     let far = PutDown {
         at: Isometry2::new(Vector2::new(3.0, 0.0), 0.0),
@@ -740,6 +749,42 @@ fn what_is_held_is_put_down_by_height_where_only_the_empty_tool_senses_contact()
     });
     // Not to below the table: the object hangs below the tip, as high as it stood.
     assert!((end_m.unwrap() - 0.041).abs() < 1e-3, "{end_m:?}");
+}
+
+#[test]
+fn what_is_held_stays_held_where_contact_is_expected_and_does_not_come() {
+    let mut robot = ScriptedRobot::new();
+    robot.contacts_m = [Some(0.041), None];
+    let error = robot.run_on(&TOUCHDOWN).unwrap_err();
+    let ExecuteError::Primitive(PrimitiveError::MissedContact {
+        phase: DescendToPlace,
+        height_m,
+    }) = error
+    else {
+        panic!("{error}");
+    };
+    // The window is 10 mm, the table at 0.
+    assert!((height_m + 0.01).abs() < 1e-6, "{height_m}");
+    assert_eq!(suctions(&robot), [true]);
+    assert!(!robot.is_home());
+
+    // Where it was lost on the way down there is nothing to hold.
+    let mut robot = ScriptedRobot::new();
+    robot.contacts_m = [Some(0.041), None];
+    // Motions: 0 approach, 1 and 2 descent, 3 lift, 4 transfer, 5 and 6 descent.
+    robot.drops_at = Some(6);
+    assert_eq!(robot.run_on(&TOUCHDOWN), Ok(Outcome::Dropped));
+    assert_eq!(suctions(&robot), [true, false]);
+    assert!(robot.is_home());
+}
+
+#[test]
+fn without_known_surfaces_what_is_held_is_released_at_the_end_of_the_way_down() {
+    let mut robot = ScriptedRobot::new();
+    robot.contacts_m = [Some(0.04), None];
+    let (outcome, _) = robot.run(&PrimitiveSettings::RIGID);
+    assert_eq!(outcome, Ok(Outcome::Placed));
+    assert_eq!(suctions(&robot), [true, false]);
 }
 
 #[test]

@@ -654,6 +654,48 @@ mod tests {
     }
 
     #[test]
+    fn a_proposal_is_refused_where_only_the_way_home_after_a_failure_would_hit_something() {
+        // Stopped over the place; the pick lies on the other side.
+        let seen = Arc::new(Heightmap::new(heightmap::Workspace::RAVENS));
+        let robot = RobotNow {
+            seen: Some((seen, Duration::ZERO)),
+            ..robot_at(0.25, 0.3)
+        };
+        let pose = |y_m| Isometry2::new(Vector2::new(0.5, y_m), 0.0);
+        let proposal = Proposal {
+            action: PickPlace {
+                pick: pose(-0.25),
+                place: pose(0.25),
+            },
+            ..proposal(0.5)
+        };
+        planned(&robot, &proposal).unwrap();
+        let arm = &robot.arm;
+        let over_pick = Arm::tip_down(&proposal.action.pick, 0.24);
+        let over_pick = arm.solve(&over_pick, &arm.ready).unwrap();
+        // A ball hangs half-way home from the pick.
+        let half_way = arm.tip(&(0.5 * (over_pick + arm.home))).translation;
+        let ball = format!(
+            "<link name=\"ball\"><collision><geometry><sphere radius=\"0.02\"/></geometry></collision></link>\
+            <joint name=\"world-ball\" type=\"fixed\"><parent link=\"world\"/><child link=\"ball\"/>\
+            <origin xyz=\"{} {} {}\" rpy=\"0 0 0\"/></joint></robot>",
+            half_way.x, half_way.y, half_way.z
+        );
+        let urdf = WorkCell::builtin().unwrap().urdf;
+        let cell = WorkCell::parse(&urdf.replace("</robot>", &ball), "cell.urdf").unwrap();
+        let checker = CollisionChecker::new(&cell, collision::Margins::default()).unwrap();
+        let robot = RobotNow {
+            checker: Arc::new(checker),
+            ..robot
+        };
+        let reason = planned(&robot, &proposal).unwrap_err();
+        assert!(
+            reason.starts_with("if ") && reason.contains("Home") && reason.contains("ball"),
+            "{reason}"
+        );
+    }
+
+    #[test]
     fn a_rehearsal_holds_while_the_arm_stands_there_and_the_view_is_unchanged() {
         let mut robot = robot_at(0.35, 0.2);
         let proposal = proposal(0.5);

@@ -24,7 +24,7 @@ use std::collections::BTreeMap;
 use std::time::Duration;
 
 use camera_noise::Perturbation;
-use driver_model::{HardwareSettings, PathDeviation, Servo, Vacuum};
+use driver_model::{HardwareSettings, PathDeviation, Servo, Vacuum, Valves};
 use multiravens::{Assessment, CellError, Environment, EnvironmentError, MotionEnd, Problem, Tick};
 use ur5::{JointTrajectory, Joints, PlanError, WorkCell};
 
@@ -441,6 +441,9 @@ impl SimulatedCell {
             return;
         }
         let suction = self.valve && self.has_power(self.wiring.suction_pin);
+        let blow_off = u8::try_from(self.hardware.blow_off_pin).is_ok_and(|pin| {
+            self.has_power(pin) && self.outputs.get(&pin).is_some_and(|level| *level)
+        });
         self.leaked &= suction;
         let cell = self.environment.cell_mut();
         if suction && !self.leaked && !cell.is_holding() && (moving || !cell.suction()) {
@@ -449,7 +452,8 @@ impl SimulatedCell {
             cell.set_suction(true);
         }
         let closed = cell.is_holding();
-        let stays = self.vacuum.update(&self.hardware, now, suction, closed);
+        let valves = Valves { suction, blow_off };
+        let stays = self.vacuum.update(&self.hardware, now, valves, closed);
         if closed && !stays {
             cell.set_suction(false);
             self.leaked = suction;

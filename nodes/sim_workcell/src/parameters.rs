@@ -109,6 +109,7 @@ impl Parameters for SimWorkcellParameters {
         ("hardware.vacuum_build_s", DELAY),
         ("hardware.vacuum_release_s", DELAY),
         ("hardware.vacuum_leak_s", Range::NOT_NEGATIVE),
+        ("hardware.blow_off_pin", Range::Integer(-1, 17)),
         ("hardware.enable_pin", Range::Integer(-1, 17)),
     ];
     const CHANGEABLE: &'static [&'static str] = &[

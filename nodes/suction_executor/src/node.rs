@@ -22,8 +22,8 @@ use step_protocol::{ApprovalGate, GateRules, Presence, Recovery, StopCause};
 use tokio::sync::{mpsc, watch};
 use tokio::time::timeout_at;
 use tracing::warn;
-use ur_driver::DriverClient;
 use ur_driver::status::DriverStatus;
+use ur_driver::{ActivateError, ActiveExecutor, DriverClient};
 use ur5::WorkCell;
 
 use self::action::{Goal, cancel_of};
@@ -111,7 +111,7 @@ pub struct ExecutorNode {
 
 impl Active for ExecutorNode {
     async fn run(&mut self, node: &Node) -> anyhow::Result<()> {
-        let _active = self.driver.heartbeat.activate(node).await?;
+        let active = self.driver.activate(node).await?;
         let parameters = self.parameters.clone();
         let (phase_sender, phases) = mpsc::unbounded_channel();
         let executor = Executor {
@@ -147,7 +147,7 @@ impl Active for ExecutorNode {
             status: self.driver.status.clone(),
             origin: self.driver.origin,
         };
-        executor.run().await
+        executor.run(&active).await
     }
 }
 
@@ -192,8 +192,9 @@ struct Executor<'a> {
 }
 
 impl Executor<'_> {
-    async fn run(mut self) -> anyhow::Result<()> {
+    async fn run(mut self, active: &ActiveExecutor) -> anyhow::Result<()> {
         let node = self.node.clone();
+        let mut is_deposed = false;
         let mut diagnostics = tokio::time::interval(DIAGNOSTICS_PERIOD);
         loop {
             let deadline = self.gate.deadline().map(|deadline| self.origin + deadline);
@@ -217,6 +218,10 @@ impl Executor<'_> {
                     #[cfg(feature = "planted_faults")]
                     self.plant_now_and_then();
                     self.rehearse_next();
+                }
+                () = active.deposed() => {
+                    is_deposed = true;
+                    break;
                 }
                 () = node.deactivated() => break,
             }
@@ -245,6 +250,9 @@ impl Executor<'_> {
         let quiet = timeout_at(deadline, self.driver.heartbeat.quiet()).await;
         if quiet.is_err() {
             warn!("the driver has not answered a goal");
+        }
+        if is_deposed {
+            return Err(ActivateError::AnotherIsActive.into());
         }
         Ok(())
     }

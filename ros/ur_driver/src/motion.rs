@@ -4,6 +4,7 @@
 
 use std::future::Future;
 use std::sync::Arc;
+use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
 
 use msgs::Action;
@@ -21,6 +22,9 @@ use crate::{DriverClient, DriverError, DriverParameters};
 pub(crate) const WATCH_PERIOD: Duration = Duration::from_millis(20);
 /// How long the answer to a cancel is waited for, and the pause before goals are cancelled again while the arm does not come to rest.
 const CANCEL_PERIOD: Duration = Duration::from_millis(200);
+/// A driver that answers later than this has the fault of its issue 1908: `trajectory_until_node` takes 1 to 2 s, and rejects what has
+/// ended by then.
+const PROMPT_ANSWER: Duration = Duration::from_millis(900);
 /// After the time that an action may take to answer, an answer that is still to come is waited for by so much more.
 const LATE_ANSWER: Duration = Duration::from_secs(30);
 
@@ -59,6 +63,13 @@ impl DriverClient {
             Err(error) => return Err(self.break_off(error).await),
         };
         let accepted = begin.elapsed();
+        if accepted > PROMPT_ANSWER && !self.is_late.swap(true, Ordering::Relaxed) {
+            warn!(
+                "{} has taken {:.1} s to accept a goal. UR's driver takes 1 to 2 s before the fix of its issue 1908, and may reject short descents: docs/guide/deploy.md",
+                client.name(),
+                accepted.as_secs_f64()
+            );
+        }
         let ended = tokio::select! {
             end = sent.result() => end.map_err(DriverError::fault),
             trouble = trouble => Err(trouble),

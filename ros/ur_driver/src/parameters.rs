@@ -49,7 +49,7 @@ pub struct DriverParameters {
     pub blow_off_pin: i8,
     /// Namespace of `list_controllers`.
     pub controller_manager: String,
-    /// Whether controllers, the robot's software and the tool's voltage are checked before anything moves.
+    /// Whether controllers, actions, the robot's software and the tool's voltage are checked before anything moves.
     pub check_controllers: bool,
     /// Wall seconds that an action may take to answer a goal.
     pub answer_timeout_s: f64,

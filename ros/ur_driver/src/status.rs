@@ -162,25 +162,30 @@ impl DriverStatus {
             Some(false) => return Some("the robot program is not running".into()),
             None => return Some("the driver has not said whether its program runs".into()),
         }
+        let disabled = self.pins.is_some_and(|pins| pins.value.disabled);
+        let disabled = disabled.then(|| "the enabling input is low (driver.enable_pin)".into());
+        self.silence(now, max_age).or(disabled)
+    }
+
+    /// Why the driver counts as lost, if it does: neither joint nor pin states may be older than `max_age`.
+    pub fn silence(&self, now: Duration, max_age: Duration) -> Option<String> {
         let arrivals = [
             ("joint_states", self.joints.map(|joints| joints.at)),
             ("io_states", self.pins.map(|pins| pins.at)),
         ];
-        for (topic, at) in arrivals {
+        arrivals.into_iter().find_map(|(topic, at)| {
             let Some(at) = at else {
                 return Some(format!("no {topic} have arrived"));
             };
             let age = now.saturating_sub(at);
-            if age > max_age {
-                return Some(format!(
+            (age > max_age).then(|| {
+                format!(
                     "the newest {topic} are {:.1} s old, expected at most {:.1} s",
                     age.as_secs_f64(),
                     max_age.as_secs_f64()
-                ));
-            }
-        }
-        let disabled = self.pins.is_some_and(|pins| pins.value.disabled);
-        disabled.then(|| "the enabling input is low (driver.enable_pin)".into())
+                )
+            })
+        })
     }
 
     /// The safety mode, where it is one in which the robot stops.

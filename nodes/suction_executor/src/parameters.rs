@@ -16,6 +16,8 @@ pub struct SuctionExecutorParameters {
     pub require_approval: Approval,
     /// With `unsure`: proposals of at least this probability of success move unasked.
     pub sure_probability: f64,
+    /// Names of those whose approvals and rejections count; empty for everybody's.
+    pub operators: Vec<String>,
     /// Whether nothing moves while no operator is present.
     pub require_presence: bool,
     /// File that remembers a stop or fault over a restart; empty for none.
@@ -77,6 +79,7 @@ impl Default for SuctionExecutorParameters {
         Self {
             require_approval: Approval::Always,
             sure_probability: 0.99,
+            operators: Vec::new(),
             require_presence: false,
             stop_file: PathBuf::new(),
             presence_timeout_s: 1.0,
@@ -178,7 +181,12 @@ impl Parameters for SuctionExecutorParameters {
         ("driver.call_attempts", Range::Integer(1, 100)),
     ];
     // What protects people is not for the network to change, whether or not the node is configured.
-    const FIXED: &'static [&'static str] = &["require_approval", "require_presence", "stop_file"];
+    const FIXED: &'static [&'static str] = &[
+        "require_approval",
+        "operators",
+        "require_presence",
+        "stop_file",
+    ];
     const CHANGEABLE: &'static [&'static str] = &[
         "limits.clearance_m",
         "limits.lift_m",

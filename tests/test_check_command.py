@@ -24,7 +24,7 @@ def recorded(start_for_module, domain: int, tmp_path_factory: pytest.TempPathFac
     start_for_module("sim_workcell", *parameters)
     bag = tmp_path_factory.mktemp("check") / "bag"
     topics = [f"/{camera}/{topic}" for camera in ("front", "left", "right") for topic in TOPICS]
-    command = ["bag", "record", "/joint_states", "/tf_static", *topics, "--out", bag, "--duration", "15"]
+    command = ["bag", "record", "/joint_states", "/tf_static", *topics, "--out", bag, "--duration", "6"]
     sctn(domain, *command).check_returncode()
     return bag
 

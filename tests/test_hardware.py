@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 import pytest
-from cell_operator import STREAM, Operator
+from cell_operator import NAME, STREAM, Operator
 from geometry_msgs.msg import Pose2D
 from processes import REPOSITORY
 from rcl_interfaces.srv import SetParameters
@@ -289,6 +289,28 @@ def test_the_way_home_moves_only_by_an_approval_of_that_very_proposal(cell: Cell
     assert second.proposal_id != first.proposal_id
     assert cell.decide(second.proposal_id).outcome == StepResult.AT_HOME
     assert cell.decide(second.proposal_id).outcome == StepResult.REFUSED
+
+
+def test_the_approval_of_somebody_who_does_not_decide_is_refused_by_name_and_everybody_may_stop(start, operator: Operator) -> None:
+    start("sim_workcell", *parameters("sim_workcell", seed=10000))
+    cell = Cell(operator)
+    start("suction_executor", *parameters("suction_executor", operators=f'["{NAME}"]'))
+    cell.wait_until_ready()
+    proposal = propose(cell)
+    after = operator.count("step_result")
+    operator.confirm(proposal.id, StepConfirmation.APPROVE, "eve")
+    refused = operator.next("step_result", after, lambda result: result.proposal_id == proposal.id)
+    assert refused.outcome == StepResult.REFUSED, refused
+    assert "`eve` does not decide here" in refused.reason and NAME in refused.reason, refused.reason
+    assert rest_after(cell, 1.0) == 0.0
+    # It can still be approved by who decides; anybody stops it.
+    after = operator.count("step_result")
+    cell.observe(look_at(cell))
+    operator.confirm(proposal.id, StepConfirmation.APPROVE)
+    wait_until_moving(cell)
+    operator.confirm(proposal.id, StepConfirmation.STOP, "eve")
+    stopped = operator.next("step_result", after, lambda result: result.proposal_id == proposal.id)
+    assert stopped.outcome == StepResult.STOPPED, stopped
 
 
 def look_at_disk(cell: Cell) -> Callable[[Heightmap], None]:

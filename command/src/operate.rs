@@ -15,6 +15,7 @@ use std::io::Write as _;
 use std::sync::Arc;
 use std::time::Duration;
 use step_protocol::{Operator, OperatorDecision, ProposalId, Question, StepOutcome};
+use tokio::signal::unix;
 use tokio::sync::mpsc;
 use tokio::time::interval;
 
@@ -47,7 +48,7 @@ const HOME_TIMEOUT: CallOptions = CallOptions {
 };
 /// A last decision takes so long to be sent.
 const LAST_WORD: Duration = Duration::from_millis(300);
-const HELP: &str = "at any time: [s]top, [h]ome, [p]ut down what is held, [q]uit";
+const HELP: &str = "at any time: [s]top, [h]ome, [p]ut down what is held, [r]etry the step that was broken off, [q]uit";
 
 impl Operate {
     pub fn run(self) -> Result<()> {
@@ -74,6 +75,8 @@ impl Operate {
         let mut presence = interval(PRESENCE_PERIOD);
         let signal = wait_for_end();
         tokio::pin!(signal);
+        // Whoever closes the window of the terminal hangs up.
+        let mut hangup = unix::signal(unix::SignalKind::hangup()).context("SIGHUP")?;
         let ended = loop {
             tokio::select! {
                 line = lines.recv() => match line {
@@ -81,6 +84,7 @@ impl Operate {
                     Some(line) => desk.on_line(&line)?,
                     None => break "the terminal was closed",
                 },
+                _ = hangup.recv() => break "the terminal was closed",
                 result = &mut signal => {
                     result?;
                     break "ended by a signal";
@@ -95,7 +99,8 @@ impl Operate {
         }
         desk.say_presence(false);
         tokio::time::sleep(LAST_WORD).await;
-        println!("{ended}");
+        // A closed terminal shows nothing.
+        let _ = writeln!(std::io::stdout(), "{ended}");
         context.shutdown();
         Ok(())
     }
@@ -172,6 +177,8 @@ struct Desk {
     plan: Option<(ProposalId, String)>,
     /// The approved proposal whose result has not come yet.
     moving: Option<ProposalId>,
+    /// The proposal whose motion a stop or a fault has broken off: its step can be tried again.
+    broken_off: Option<ProposalId>,
 }
 
 impl Desk {
@@ -205,6 +212,7 @@ impl Desk {
             due: None,
             plan: None,
             moving: None,
+            broken_off: None,
         })
     }
 
@@ -314,8 +322,12 @@ impl Desk {
             StepOutcome::Fault | StepOutcome::Stopped | StepOutcome::NotHome
         ) {
             println!(
-                "    the arm stands where it is: [h]ome proposes the way home, [p]ut down lowers what is held first"
+                "    the arm stands where it is: [h]ome proposes the way home, [p]ut down lowers what is held first, [r]etry tries the step again"
             );
+        }
+        if result.arm_moved() && !result.outcome.is_of_home() {
+            let breaks_off = matches!(result.outcome, StepOutcome::Fault | StepOutcome::Stopped);
+            self.broken_off = breaks_off.then_some(result.proposal_id);
         }
         self.operator.on_result(result)
     }
@@ -362,6 +374,18 @@ impl Desk {
                 let _ = sender.send((puts_down, answer.map_err(|error| error.to_string())));
             });
             return Ok(());
+        }
+        if key == "r" {
+            return match self.broken_off.take() {
+                Some(id) => {
+                    println!("the step is tried again once its next proposal is approved");
+                    self.decide(id, OperatorDecision::Retry)
+                }
+                None => {
+                    println!("no step was broken off; {HELP}");
+                    Ok(())
+                }
+            };
         }
         let Some(due) = &self.due else {
             println!("nothing is to be decided; {HELP}");

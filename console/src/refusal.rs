@@ -24,7 +24,11 @@ impl Refusal {
 }
 
 /// What a person should do about a reason why a proposal that stands may not be carried out now: part of the reason, advice.
-const ADVICE: [(&str, &str); 16] = [
+const ADVICE: [(&str, &str); 17] = [
+    (
+        "does not decide here",
+        "Ask one of those who are named, or have your name added to the executor's parameter operators.",
+    ),
     (
         "no operator is present",
         "Keep the page of the operator open and in sight while the arm moves.",

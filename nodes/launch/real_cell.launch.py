@@ -86,7 +86,8 @@ def generate_launch_description() -> LaunchDescription:
             DeclareLaunchArgument("console", default_value="true", description="Whether to serve the operator's page."),
             DeclareLaunchArgument("console_port", default_value="8750", description="Port of the operator's page; 0: the system chooses."),
             DeclareLaunchArgument("rviz", default_value="false", description="Whether to show the cell in RViz."),
-            node("camera_fusion", calibration=LaunchConfiguration("calibration")),
+            # Real depth has noise: the median over a sixth of a second at 30 Hz.
+            node("camera_fusion", calibration=LaunchConfiguration("calibration"), frames=5),
             node("goal_oracle", demonstration=LaunchConfiguration("demonstration"), start_empty=True),
             node(
                 "gctn_policy",

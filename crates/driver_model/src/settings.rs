@@ -25,7 +25,8 @@ pub struct HardwareSettings {
     pub path_tolerance_rad: f64,
     /// Standard deviation of the positions in `joint_states` (rad).
     pub encoder_noise_rad: f64,
-    /// Share of the planned speed, as the slider on the teach pendant sets it (0.01 to 1).
+    /// Share of the planned speed, as the slider on the teach pendant sets it (0.01 to 1), also in the middle of a motion of an arm that lags
+    /// or brakes.
     pub speed_scaling: f64,
     /// How long the arm takes to stop when a goal is cancelled or the driver stops it (s of simulated time).
     pub braking_time_s: f64,

@@ -66,6 +66,8 @@ pub struct GateRules {
     pub confirmation_grace: Duration,
     /// Which proposals move only when somebody approves them.
     pub require_approval: RequireApproval,
+    /// Names of those whose approvals and rejections count; empty where everybody's do.
+    pub operators: Vec<String>,
 }
 
 /// What has become of the cells of a change.
@@ -149,6 +151,18 @@ pub enum InvalidProposal {
 /// Why a confirmation moves nothing.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum Refusal {
+    /// Somebody has said it who does not decide.
+    #[error(
+        "proposal {id}: `{name}` does not decide here, expected one of {operators:?} (parameter operators)"
+    )]
+    NotAnOperator {
+        /// The proposal.
+        id: ProposalId,
+        /// Who has said it.
+        name: String,
+        /// Who decides.
+        operators: Vec<String>,
+    },
     /// No such proposal has arrived.
     #[error("proposal {id} is unknown")]
     Unknown {
@@ -574,6 +588,29 @@ impl ApprovalGate {
             Some(reason) => Verdict::Refuse(reason.clone().into()),
             None => Verdict::Wait(Refusal::Unknown { id }),
         }
+    }
+
+    /// Checks that somebody's decision on a proposal counts: where the rules name operators, approvals and rejections of these alone. A stop is
+    /// taken from everybody. To be asked before [`Self::on_confirmation`]; names are no authentication.
+    ///
+    /// # Errors
+    /// The name is none of the operators'.
+    pub fn check_operator(
+        &self,
+        id: ProposalId,
+        decision: OperatorDecision,
+        name: &str,
+    ) -> Result<(), Refusal> {
+        let operators = &self.rules.operators;
+        let decides = operators.is_empty() || operators.iter().any(|operator| operator == name);
+        if decides || decision == OperatorDecision::Stop {
+            return Ok(());
+        }
+        Err(Refusal::NotAnOperator {
+            id,
+            name: name.to_owned(),
+            operators: operators.clone(),
+        })
     }
 
     /// Takes a confirmation. Decisions that speak of a motion that was carried out are for the goal tracker.

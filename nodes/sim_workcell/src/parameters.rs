@@ -121,6 +121,8 @@ impl Parameters for SimWorkcellParameters {
         "hardware.servo_delay_s",
         "hardware.encoder_noise_rad",
         "hardware.speed_scaling",
+        "hardware.inactive_controllers",
+        "hardware.tool_voltage",
         "hardware.vacuum_leak_s",
         "hardware.enabled",
         "hardware.fault",

@@ -86,6 +86,7 @@ fn rules(parameters: &SuctionExecutorParameters) -> GateRules {
         changes: changes(parameters),
         confirmation_grace: Duration::from_secs_f64(parameters.confirmation_grace_s),
         require_approval: parameters.require_approval(),
+        operators: parameters.operators.clone(),
     }
 }
 

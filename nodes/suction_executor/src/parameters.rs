@@ -17,6 +17,8 @@ pub struct SuctionExecutorParameters {
     pub require_approval: Approval,
     /// With `unsure`: proposals of at least this probability of success move unasked.
     pub sure_probability: f64,
+    /// Names of those whose approvals and rejections count; empty for everybody's.
+    pub operators: Vec<String>,
     /// Whether nothing moves while no operator is present.
     pub require_presence: bool,
     /// File that remembers a stop or fault over a restart; empty for none.
@@ -94,6 +96,7 @@ impl Default for SuctionExecutorParameters {
         Self {
             require_approval: Approval::Always,
             sure_probability: 0.99,
+            operators: Vec::new(),
             require_presence: false,
             stop_file: PathBuf::new(),
             presence_timeout_s: 1.0,
@@ -214,6 +217,7 @@ impl Parameters for SuctionExecutorParameters {
     const FIXED: &'static [&'static str] = &[
         "require_approval",
         "sure_probability",
+        "operators",
         "require_presence",
         "presence_timeout_s",
         "stop_file",

@@ -67,6 +67,15 @@ impl DriverState {
         }
     }
 
+    /// Loads the controllers anew, as the settings have them now.
+    pub fn set_controllers(&self, actions: &ActionNames, hardware: &HardwareSettings) {
+        *self.controllers() = Controllers::new(
+            actions.controller(),
+            &hardware.inactive_controllers,
+            hardware.software_major,
+        );
+    }
+
     /// A dead driver answers nothing, and does not know of what was asked meanwhile when it is started again.
     pub fn set_dead(&self, dead: bool) {
         self.dead.send_replace(dead);

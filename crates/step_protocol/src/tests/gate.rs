@@ -9,7 +9,8 @@ use pick_place::{PickPlace, PrimitiveSettings};
 
 use crate::{
     ApprovalGate, CannotBegin, GateAction, GateRules, JointPositions, OperatorDecision, Proposal,
-    ProposalId, ProposalStatus, Proposed, Recovery, RequireApproval, RobotState, StepOutcome,
+    ProposalId, ProposalStatus, Proposed, Recovery, Refusal, RequireApproval, RobotState,
+    StepOutcome,
 };
 
 pub(super) const NOW: Duration = Duration::from_secs(100);
@@ -29,6 +30,7 @@ fn rules() -> GateRules {
         changes: ChangeRules::default(),
         confirmation_grace: GRACE,
         require_approval: RequireApproval::Always,
+        operators: Vec::new(),
     }
 }
 
@@ -290,6 +292,38 @@ fn what_waits_for_its_proposal_does_not_survive_a_stop_a_fault_or_a_deactivation
         assert_eq!(gate.on_news(&READY, NOW), [], "{end}");
         assert!(matches!(approve(&mut gate, 8)[..], [GateAction::Move(_)]));
     }
+}
+
+#[test]
+fn where_operators_are_named_nobody_else_approves_or_rejects_and_everybody_may_stop() {
+    let id = ProposalId(7);
+    let anybody = ApprovalGate::new(rules());
+    assert_eq!(
+        anybody.check_operator(id, OperatorDecision::Approve, "eve"),
+        Ok(())
+    );
+    let gate = ApprovalGate::new(GateRules {
+        operators: vec!["anna".into(), "bob".into()],
+        ..rules()
+    });
+    for decision in [OperatorDecision::Approve, OperatorDecision::Reject] {
+        for name in ["anna", "bob"] {
+            assert_eq!(gate.check_operator(id, decision, name), Ok(()));
+        }
+        for name in ["eve", "", "Anna", "anna "] {
+            let refusal = gate.check_operator(id, decision, name).unwrap_err();
+            assert!(matches!(refusal, Refusal::NotAnOperator { .. }));
+            let text = refusal.to_string();
+            assert!(
+                text.contains(&format!("`{name}`")) && text.contains("anna"),
+                "{text}"
+            );
+        }
+    }
+    assert_eq!(
+        gate.check_operator(id, OperatorDecision::Stop, "eve"),
+        Ok(())
+    );
 }
 
 #[test]

@@ -255,6 +255,7 @@ fn gate() -> ApprovalGate {
         changes: ChangeRules::default(),
         confirmation_grace: GRACE,
         require_approval: RequireApproval::Always,
+        operators: Vec::new(),
     })
 }
 

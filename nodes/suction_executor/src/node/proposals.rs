@@ -5,6 +5,7 @@ use step_protocol::{
     GateAction, Judgement, OperatorDecision, Proposal, ProposalId, Proposed, StopCause,
 };
 use tracing::info;
+use ur_driver::planted::{Planted, is_planted};
 
 use super::Executor;
 
@@ -63,6 +64,14 @@ impl Executor<'_> {
         );
         #[cfg(feature = "planted_faults")]
         if self.plant_at_confirmation(id, decision) {
+            return;
+        }
+        if let Err(refusal) = self
+            .gate
+            .check_operator(id, decision, &message.operator_name)
+            && !is_planted(Planted::AnyOperator)
+        {
+            self.report(self.refusal(id, refusal.to_string()), None);
             return;
         }
         self.confirm(id, decision);

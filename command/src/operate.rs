@@ -14,7 +14,10 @@ use node_kit::{
 use std::io::Write as _;
 use std::sync::Arc;
 use std::time::Duration;
-use step_protocol::{Operator, OperatorDecision, ProposalId, Question, StepOutcome};
+use step_protocol::{
+    Operator, OperatorDecision, PRESENCE_PERIOD, ProposalId, Question, RECOVERY_TIMEOUT,
+    StepOutcome,
+};
 use tokio::signal::unix;
 use tokio::sync::mpsc;
 use tokio::time::interval;
@@ -39,12 +42,10 @@ pub struct Operate {
     ros: Vec<String>,
 }
 
-/// How often the executor hears that somebody is at the terminal.
-const PRESENCE_PERIOD: Duration = Duration::from_millis(200);
 /// The executor plans and checks a way home.
 const HOME_TIMEOUT: CallOptions = CallOptions {
     attempts: 1,
-    timeout: Duration::from_secs(60),
+    timeout: RECOVERY_TIMEOUT,
 };
 /// A last decision takes so long to be sent.
 const LAST_WORD: Duration = Duration::from_millis(300);
@@ -69,7 +70,7 @@ impl Operate {
         ];
         arguments.extend(self.ros.clone());
         let (context, node) = plain_node("sctn_operate", &arguments)?;
-        let mut desk = Desk::new(&node, &self)?;
+        let mut terminal = Terminal::new(&node, &self)?;
         println!("{HELP}");
         let mut lines = lines_of_terminal();
         let mut presence = interval(PRESENCE_PERIOD);
@@ -81,7 +82,7 @@ impl Operate {
             tokio::select! {
                 line = lines.recv() => match line {
                     Some(line) if line.trim().eq_ignore_ascii_case("q") => break "ended by the operator",
-                    Some(line) => desk.on_line(&line)?,
+                    Some(line) => terminal.on_line(&line)?,
                     None => break "the terminal was closed",
                 },
                 _ = hangup.recv() => break "the terminal was closed",
@@ -89,15 +90,15 @@ impl Operate {
                     result?;
                     break "ended by a signal";
                 }
-                _ = presence.tick() => desk.say_presence(true),
-                () = desk.listen() => {}
+                _ = presence.tick() => terminal.say_presence(true),
+                () = terminal.listen() => {}
             }
         };
         // Nobody is left to stop it.
-        if desk.moving.is_some() {
-            desk.decide(desk.subject(), OperatorDecision::Stop)?;
+        if terminal.moving.is_some() {
+            terminal.decide(terminal.subject(), OperatorDecision::Stop)?;
         }
-        desk.say_presence(false);
+        terminal.say_presence(false);
         tokio::time::sleep(LAST_WORD).await;
         // A closed terminal shows nothing.
         let _ = writeln!(std::io::stdout(), "{ended}");
@@ -152,7 +153,7 @@ impl Due {
 }
 
 /// What arrives, and what is decided.
-struct Desk {
+struct Terminal {
     node: Node,
     name: String,
     approve_only: bool,
@@ -181,7 +182,7 @@ struct Desk {
     broken_off: Option<ProposalId>,
 }
 
-impl Desk {
+impl Terminal {
     fn new(node: &Node, given: &Operate) -> Result<Self> {
         let user = || std::env::var("USER").ok().filter(|name| !name.is_empty());
         let (home_sender, homes) = mpsc::unbounded_channel();

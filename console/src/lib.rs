@@ -6,7 +6,8 @@
 //!
 //! ```
 //! use std::time::Duration;
-//! use console::{Phase, Run, Watch};
+//! use console::{Run, Watch};
+//! use step_protocol::RunPhase;
 //!
 //! let run = Run::new(Watch {
 //!     nodes: vec!["/suction_executor".into()],
@@ -14,11 +15,12 @@
 //!     stale_after: Duration::from_secs(3),
 //!     changes: heightmap::ChangeRules::default(),
 //! });
-//! assert_eq!(run.phase(), Phase::NoGoal);
+//! assert_eq!(run.phase(), RunPhase::NoGoal);
 //! ```
 
 mod cameras;
 mod checkpoints;
+mod files;
 mod history;
 mod lesson;
 mod library;
@@ -40,10 +42,10 @@ pub use library::{Entry, Libraries, Library};
 pub use listener::{Listener, Stream, TlsError, tls_acceptor};
 pub use preview::{InvalidPlan, Motion, Plan, Point, ScoreMaps};
 pub use refusal::Refusal;
-pub use run::{Decision, InvalidMessage, NodeReport, Phase, Pose, Run, View, Watch};
-pub use server::{Access, Page, router};
+pub use run::{Decision, InvalidMessage, NodeReport, Pose, Run, View, Watch};
+pub use server::{Access, InvalidToken, Page, router};
 pub use session::{Sessions, ViewerId};
-pub use state::{Command, Console, PolicyState, State, no_recovery};
+pub use state::{Answer, Command, Console, PolicyState, State};
 pub use tokio_rustls::TlsAcceptor;
 pub use training::Trainings;
 

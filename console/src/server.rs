@@ -30,7 +30,7 @@ use crate::library::Libraries;
 use crate::state::Console;
 use crate::training::Trainings;
 
-pub use self::access::Access;
+pub use self::access::{Access, InvalidToken};
 
 /// Largest body of a request [bytes].
 const LARGEST_BODY: usize = 16 * 1024;
@@ -236,4 +236,4 @@ async fn off_thread<T: Send + 'static>(
 }
 
 #[cfg(test)]
-mod tests;
+pub(crate) mod tests;

@@ -6,7 +6,7 @@ use serde::{Serialize, Serializer};
 use step_protocol::{ProposalId, Recovery};
 
 use super::{Command, State};
-use crate::refusal::{Refusal, advice};
+use crate::refusal::{Refusal, advice_on};
 use crate::run::Decision;
 use crate::session::ViewerId;
 
@@ -30,13 +30,13 @@ fn as_name<S: Serializer>(recovery: &Recovery, serializer: S) -> Result<S::Ok, S
 }
 
 /// Why a recovery cannot be carried out, as a sentence.
-pub fn no_recovery(recovery: Recovery, reason: &str) -> Refusal {
+pub(super) fn no_recovery(recovery: Recovery, reason: &str) -> Refusal {
     let because = reason.trim().trim_end_matches('.');
     let text = match recovery {
         Recovery::Home => format!("There is no way home: {because}."),
         Recovery::PutDown => format!("What is held cannot be put down: {because}."),
     };
-    Refusal::new(text, advice(reason))
+    Refusal::new(text, advice_on(reason))
 }
 
 impl State {
@@ -57,7 +57,7 @@ impl State {
     }
 
     /// The executor has proposed a recovery; it `needs_approval`, or the arm is on its way.
-    pub fn on_recovery(
+    pub(super) fn on_recovery(
         &mut self,
         recovery: Recovery,
         proposal_id: ProposalId,

@@ -12,7 +12,7 @@ use pick_place::{
     ContactSettings, ContactSign, PickPlace, PrimitiveSettings, PutDown, go_home, put_down,
 };
 use step_protocol::{
-    AT_REST_RAD, CannotBegin, JointPositions, Proposal, ProposalId, Recovery, RobotState,
+    AT_REST_RAD, CannotBegin, JointPositions, Obstacle, Proposal, ProposalId, Recovery, RobotState,
 };
 use ur5::{Arm, AtHome, Joints};
 
@@ -126,7 +126,7 @@ impl Rehearsed {
 
     fn verdict(&self) -> Result<(), CannotBegin> {
         let planned = self.planned.as_ref();
-        planned.map_err(|reason| CannotBegin::Refused(reason.clone()))?;
+        planned.map_err(|reason| CannotBegin::Refused(reason.clone().into()))?;
         Ok(())
     }
 }
@@ -173,12 +173,13 @@ pub struct RobotNow {
 }
 
 impl RobotState for RobotNow {
-    fn obstacle(&self) -> Option<String> {
-        self.obstacle.clone()
+    fn obstacle(&self) -> Option<Obstacle> {
+        self.obstacle.clone().map(Obstacle::from)
     }
 
     fn check_motion(&self, proposal: &Proposal) -> Result<(), CannotBegin> {
-        self.check_view(proposal).map_err(CannotBegin::Refused)?;
+        let refused = |reason: String| CannotBegin::Refused(reason.into());
+        self.check_view(proposal).map_err(refused)?;
         let rehearsed = self.rehearsal_of(proposal.id);
         rehearsed.ok_or(CannotBegin::NotRehearsed)?.verdict()
     }
@@ -186,7 +187,8 @@ impl RobotState for RobotNow {
     fn check_recovery(&self, recovery: Recovery) -> Result<JointPositions, CannotBegin> {
         let rehearsed = self.rehearsal_of_recovery(recovery);
         rehearsed.ok_or(CannotBegin::NotRehearsed)?.verdict()?;
-        self.known_joints().map_err(CannotBegin::Refused)
+        let refused = |reason: String| CannotBegin::Refused(reason.into());
+        self.known_joints().map_err(refused)
     }
 }
 
@@ -418,7 +420,7 @@ mod tests {
 
     fn text(cannot: CannotBegin) -> String {
         match cannot {
-            CannotBegin::Refused(reason) => reason,
+            CannotBegin::Refused(obstacle) => obstacle.into(),
             CannotBegin::NotRehearsed => "not rehearsed".to_owned(),
         }
     }

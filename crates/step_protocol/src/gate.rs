@@ -12,7 +12,10 @@ use nalgebra::SVector;
 use pick_place::{PickPlace, PrimitiveSettings};
 
 use crate::mutation::{Mutation, planted};
-use crate::{OperatorDecision, Proposal, ProposalId, ProposalStatus, StepOutcome};
+use crate::{
+    MotionCause, Obstacle, OperatorDecision, Proposal, ProposalId, ProposalStatus, RefusalReason,
+    StepOutcome,
+};
 
 /// Heightmaps kept, by stamp, until the proposals that were made from them arrive.
 const HEIGHTMAPS: usize = 64;
@@ -23,7 +26,7 @@ const INVALID: usize = 64;
 /// Confirmations that wait for their proposal; more are refused at once.
 const WAITING: usize = 16;
 /// How long an approval waits until its motion has been rehearsed: less than a second, unless the machine is overloaded.
-const REHEARSAL_GRACE: Duration = Duration::from_secs(5);
+pub(crate) const REHEARSAL_GRACE: Duration = Duration::from_secs(5);
 
 /// Which proposals move only when somebody approves them.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -40,7 +43,8 @@ pub enum RequireApproval {
 }
 
 impl RequireApproval {
-    fn of(&self, proposal: &Proposal) -> bool {
+    /// Whether this proposal needs an approval, as long as nothing was stopped.
+    fn asks_for(&self, proposal: &Proposal) -> bool {
         match self {
             Self::Always => true,
             Self::Unsure { threshold } => {
@@ -50,6 +54,42 @@ impl RequireApproval {
             }
             Self::Never => false,
         }
+    }
+}
+
+/// Whether the executor carries proposals out by itself: as the rule says, and from a stop or a fault on not before the next
+/// approval.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Unasked {
+    is_on: bool,
+}
+
+impl Unasked {
+    /// Nothing was stopped.
+    pub fn new(rule: RequireApproval) -> Self {
+        Self {
+            is_on: rule != RequireApproval::Always,
+        }
+    }
+
+    /// A stop or a fault has come: nothing goes on by itself.
+    pub fn stop(&mut self) {
+        self.is_on = false;
+    }
+
+    /// An operator has approved a proposal, and it moves: things go on.
+    pub fn go_on(&mut self, rule: RequireApproval) {
+        *self = Self::new(rule);
+    }
+
+    /// Whether some proposals are carried out unasked.
+    pub fn is_on(&self) -> bool {
+        self.is_on
+    }
+
+    /// Whether this one is.
+    pub fn moves(&self, rule: RequireApproval, proposal: &Proposal) -> bool {
+        self.is_on && !rule.asks_for(proposal)
     }
 }
 
@@ -209,12 +249,12 @@ pub enum Refusal {
         id: ProposalId,
     },
     /// The robot is not ready, or the proposed motion is not feasible.
-    #[error("proposal {id}: {reason}")]
+    #[error("proposal {id}: {obstacle}")]
     Robot {
         /// The proposal.
         id: ProposalId,
         /// The reason.
-        reason: String,
+        obstacle: Obstacle,
     },
     /// Made from what was seen before the last motion ended.
     #[error(
@@ -292,6 +332,41 @@ pub enum Refusal {
     },
 }
 
+impl InvalidProposal {
+    fn reason(&self) -> RefusalReason {
+        match self {
+            Self::OutsideWorkspace { .. } => RefusalReason::OutsideWorkspace,
+            Self::Message(_)
+            | Self::Frame { .. }
+            | Self::NotFinite { .. }
+            | Self::Settings { .. }
+            | Self::DifferentContents { .. } => RefusalReason::InvalidProposal,
+        }
+    }
+}
+
+impl Refusal {
+    /// What a person can do something about; its words are in the text.
+    pub fn reason(&self) -> RefusalReason {
+        match self {
+            Self::Unknown { .. } | Self::NothingToStop { .. } => RefusalReason::Unknown,
+            Self::Invalid(invalid) => invalid.reason(),
+            Self::NotPending { .. } => RefusalReason::NotPending,
+            Self::NotAnOperator { .. } => RefusalReason::NotAnOperator,
+            Self::Busy { .. } => RefusalReason::Busy,
+            Self::Homing { .. } => RefusalReason::OnItsWayHome,
+            Self::HomeFromElsewhere { .. } => RefusalReason::HomeFromElsewhere,
+            Self::Robot { obstacle, .. } => obstacle.reason(),
+            Self::OldObservation { .. } => RefusalReason::OldObservation,
+            Self::NoSourceHeightmap { .. } => RefusalReason::NoSourceHeightmap,
+            Self::OtherWorkspace { .. } => RefusalReason::OtherWorkspace,
+            Self::ObservationChanged { .. } => RefusalReason::ObservationChanged,
+            Self::NotRehearsed { .. } => RefusalReason::NotRehearsed,
+            Self::StopCame { .. } | Self::MotionBrokenOff { .. } => RefusalReason::Stopped,
+        }
+    }
+}
+
 /// What became of a proposal that arrived.
 #[derive(Clone, Debug, PartialEq)]
 pub enum Proposed {
@@ -334,7 +409,7 @@ pub enum GateAction {
 /// What the gate asks about the robot, at the moment of an approval.
 pub trait RobotState {
     /// Why the arm must not move now, if there is a reason.
-    fn obstacle(&self) -> Option<String>;
+    fn obstacle(&self) -> Option<Obstacle>;
 
     /// Whether the whole motion can begin: it was rehearsed from where the arm is, on what is seen. Answers at once: a stop may be waiting.
     ///
@@ -353,10 +428,13 @@ pub trait RobotState {
 #[derive(Clone, Debug, PartialEq, Eq)]
 pub enum CannotBegin {
     /// For this reason.
-    Refused(String),
+    Refused(Obstacle),
     /// It was not rehearsed, or from elsewhere or on another view.
     NotRehearsed,
 }
+
+/// The executor plans a recovery, checks it for collisions and proposes it in this time.
+pub const RECOVERY_TIMEOUT: Duration = Duration::from_secs(60);
 
 /// What brings the arm home after a stop or a fault.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -433,7 +511,7 @@ pub struct ApprovalGate {
     /// Heightmaps from before the end of the last motion are no ground to move on.
     moved_until: Option<Duration>,
     /// Whether new proposals move by themselves.
-    automatic: bool,
+    unasked: Unasked,
 }
 
 impl ApprovalGate {
@@ -450,14 +528,14 @@ impl ApprovalGate {
             home: None,
             homing: None,
             moved_until: None,
-            automatic: rules.require_approval != RequireApproval::Always,
+            unasked: Unasked::new(rules.require_approval),
             rules,
         }
     }
 
     /// Nothing moves by itself before the next approval: a stop or fault came before this gate was made.
     pub fn remember_stop(&mut self) {
-        self.automatic = false;
+        self.unasked.stop();
     }
 
     /// The proposal that is being carried out.
@@ -468,7 +546,7 @@ impl ApprovalGate {
     /// Whether the executor approves some new proposals itself: approval is not always required, and no stop or fault has come
     /// since the last approval.
     pub fn is_automatic(&self) -> bool {
-        self.automatic
+        self.unasked.is_on()
     }
 
     /// Whether the executor approves this proposal itself: it is the newest one, and the rules do not ask for an approval of it. A way
@@ -478,12 +556,12 @@ impl ApprovalGate {
             if planted(Mutation::HomeMovesUnasked) {
                 return true;
             }
-            return self.automatic && self.rules.require_approval == RequireApproval::Never;
+            return self.unasked.is_on() && self.rules.require_approval == RequireApproval::Never;
         }
         let newest = self.newest.as_ref();
         let newest = newest.filter(|newest| newest.proposal.id == id);
-        self.automatic
-            && newest.is_some_and(|newest| !self.rules.require_approval.of(&newest.proposal))
+        let rule = self.rules.require_approval;
+        newest.is_some_and(|newest| self.unasked.moves(rule, &newest.proposal))
     }
 
     /// Takes the newest observation.
@@ -656,7 +734,7 @@ impl ApprovalGate {
         let mut actions = Vec::new();
         if decision == OperatorDecision::Stop {
             // Nothing goes on by itself after a stop.
-            self.automatic = false;
+            self.unasked.stop();
             if !planted(Mutation::WaitingSurvivesStop) {
                 actions.extend(self.refuse_waiting(|id| Refusal::StopCame { id }));
             }
@@ -771,12 +849,14 @@ impl ApprovalGate {
         recovery: Recovery,
         robot: &impl RobotState,
     ) -> Result<ProposalId, CannotBegin> {
-        let refuse = |reason| Err(CannotBegin::Refused(reason));
+        let refuse = |obstacle| Err(CannotBegin::Refused(obstacle));
         if let Some(id) = self.moving {
-            return refuse(format!("proposal {id} is being carried out"));
+            let busy = MotionCause::Proposal(id).busy_text();
+            return refuse(RefusalReason::Busy.because(busy));
         }
-        if self.homing.is_some() {
-            return refuse("the arm is on its way home".to_owned());
+        if let Some(id) = self.homing {
+            let busy = MotionCause::Home(id).busy_text();
+            return refuse(RefusalReason::OnItsWayHome.because(busy));
         }
         if let Some(obstacle) = robot.obstacle() {
             return refuse(obstacle);
@@ -789,7 +869,8 @@ impl ApprovalGate {
             return Ok(home.id);
         }
         if self.status(id).is_some() {
-            return refuse(format!("proposal {id} is another one"));
+            let text = format!("the id {id} is that of another proposal");
+            return refuse(RefusalReason::Other.because(text));
         }
         self.close_home(ProposalStatus::Superseded);
         self.remember(id);
@@ -822,7 +903,7 @@ impl ApprovalGate {
         if !broken_off {
             return Vec::new();
         }
-        self.automatic = false;
+        self.unasked.stop();
         self.refuse_waiting(|id| Refusal::MotionBrokenOff { id })
     }
 
@@ -873,8 +954,8 @@ impl ApprovalGate {
             return Verdict::Refuse(reason.clone().into());
         }
         let proposal = &newest.proposal;
-        if let Some(reason) = robot.obstacle() {
-            return Verdict::Refuse(Refusal::Robot { id, reason });
+        if let Some(obstacle) = robot.obstacle() {
+            return Verdict::Refuse(Refusal::Robot { id, obstacle });
         }
         if let Some(moved_until) = self.moved_until
             && proposal.stamp < moved_until
@@ -890,8 +971,8 @@ impl ApprovalGate {
         }
         match robot.check_motion(proposal) {
             Ok(()) => {}
-            Err(CannotBegin::Refused(reason)) => {
-                return Verdict::Refuse(Refusal::Robot { id, reason });
+            Err(CannotBegin::Refused(obstacle)) => {
+                return Verdict::Refuse(Refusal::Robot { id, obstacle });
             }
             Err(CannotBegin::NotRehearsed) if planted(Mutation::MovesUnrehearsed) => {}
             Err(CannotBegin::NotRehearsed) => {
@@ -905,15 +986,15 @@ impl ApprovalGate {
         self.set_status(id, ProposalStatus::Moving);
         self.moving = Some(id);
         // After a stop or a fault an approval lets things go on.
-        self.automatic = self.rules.require_approval != RequireApproval::Always;
+        self.unasked.go_on(self.rules.require_approval);
         Verdict::Act(GateAction::Move(proposal))
     }
 
     /// Approves a way home. It lets nothing else go on after a stop or a fault.
     fn approve_home(&mut self, home: Home, robot: &impl RobotState) -> Verdict {
         let id = home.id;
-        if let Some(reason) = robot.obstacle() {
-            return Verdict::Refuse(Refusal::Robot { id, reason });
+        if let Some(obstacle) = robot.obstacle() {
+            return Verdict::Refuse(Refusal::Robot { id, obstacle });
         }
         match robot.check_recovery(home.recovery) {
             Ok(from_rad) if home.is_from(&from_rad) => {}
@@ -921,8 +1002,8 @@ impl ApprovalGate {
                 self.close_home(ProposalStatus::Withdrawn);
                 return Verdict::Refuse(Refusal::HomeFromElsewhere { id });
             }
-            Err(CannotBegin::Refused(reason)) => {
-                return Verdict::Refuse(Refusal::Robot { id, reason });
+            Err(CannotBegin::Refused(obstacle)) => {
+                return Verdict::Refuse(Refusal::Robot { id, obstacle });
             }
         }
         self.home = None;

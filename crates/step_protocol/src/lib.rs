@@ -11,6 +11,7 @@ mod mutation;
 mod operator;
 mod planner;
 mod presence;
+mod reason;
 mod tracker;
 mod types;
 
@@ -19,16 +20,17 @@ mod tests;
 
 pub use gate::{
     AT_REST_RAD, ApprovalGate, CannotBegin, GateAction, GateRules, InvalidProposal, JointPositions,
-    Proposed, Recovery, Refusal, Report, RequireApproval, RobotState,
+    Proposed, RECOVERY_TIMEOUT, Recovery, Refusal, Report, RequireApproval, RobotState, Unasked,
 };
 pub use goals::{
     FAILED_PICK_RADIUS_M, FailedPicks, GoalSequence, Judgement, NoGoals, ReachedGoals, ShownStep,
     goal_steps, goals_of,
 };
 pub use motion::{MotionCause, MotionEnd, MotionWord, StopCause};
-pub use operator::{Operator, Question};
+pub use operator::{Operator, Question, RunPhase};
 pub use planner::{Job, PlannerRules, Prediction, ProposalPlanner};
-pub use presence::Presence;
+pub use presence::{PRESENCE_PERIOD, Presence};
+pub use reason::{Obstacle, RefusalReason};
 pub use tracker::{
     Capture, CaptureError, Change, ConfirmationRefusal, GoalTracker, NoSuchStep, RefusalKind,
     StepJudge,

@@ -37,12 +37,20 @@ pub(crate) enum Mutation {
     SilenceForgetsMotion,
     /// A refused proposal is never made anew.
     RefusedIsNotRenewed,
+    /// A page does not ask again where a decision was not answered.
+    UnansweredIsForgotten,
+    /// A page shows a run as stopped after it was continued.
+    ContinuedStaysStopped,
+    /// A proposal for another goal hides that for the present one from the page.
+    OtherGoalHidesProposal,
+    /// A page waits for ever where what follows a decision was lost.
+    SilenceIsNotProbed,
 }
 
 impl Mutation {
     /// All of them.
     #[cfg(test)]
-    pub(crate) const ALL: [Self; 17] = [
+    pub(crate) const ALL: [Self; 21] = [
         Self::ApprovalMovesTwice,
         Self::SupersededStaysPending,
         Self::WaitingSurvivesStop,
@@ -60,6 +68,10 @@ impl Mutation {
         Self::RefusalReopensMoving,
         Self::SilenceForgetsMotion,
         Self::RefusedIsNotRenewed,
+        Self::UnansweredIsForgotten,
+        Self::ContinuedStaysStopped,
+        Self::OtherGoalHidesProposal,
+        Self::SilenceIsNotProbed,
     ];
 }
 

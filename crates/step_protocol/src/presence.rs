@@ -2,6 +2,9 @@
 
 use std::time::Duration;
 
+/// Time between messages that say whether the operator is present.
+pub const PRESENCE_PERIOD: Duration = Duration::from_millis(200);
+
 /// The last sign of the operator. Times are monotonic, from any origin.
 #[derive(Clone, Copy, Debug)]
 pub struct Presence {

@@ -3,14 +3,14 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use heightmap::{ChangeRules, Heightmap, Workspace};
-use nalgebra::{Isometry2, Vector2};
+use heightmap::{Change, ChangeRules, Heightmap, Workspace};
+use nalgebra::{Isometry2, Point2, Vector2};
 use pick_place::{PickPlace, PrimitiveSettings};
 
 use crate::{
-    ApprovalGate, CannotBegin, GateAction, GateRules, JointPositions, OperatorDecision, Proposal,
-    ProposalId, ProposalStatus, Proposed, Recovery, Refusal, RequireApproval, RobotState,
-    StepOutcome,
+    ApprovalGate, CannotBegin, GateAction, GateRules, InvalidProposal, JointPositions, MotionCause,
+    Obstacle, OperatorDecision, Proposal, ProposalId, ProposalStatus, Proposed, Recovery, Refusal,
+    RefusalReason, RequireApproval, RobotState, StepOutcome, Unasked,
 };
 
 pub(super) const NOW: Duration = Duration::from_secs(100);
@@ -76,14 +76,14 @@ pub(super) struct Robot {
 }
 
 impl RobotState for Robot {
-    fn obstacle(&self) -> Option<String> {
-        self.obstacle.map(str::to_owned)
+    fn obstacle(&self) -> Option<Obstacle> {
+        self.obstacle.map(str::to_owned).map(Obstacle::from)
     }
 
     fn check_motion(&self, _: &Proposal) -> Result<(), CannotBegin> {
         match self.no_plan {
             _ if self.unrehearsed => Err(CannotBegin::NotRehearsed),
-            Some(reason) => Err(CannotBegin::Refused(reason.to_owned())),
+            Some(reason) => Err(CannotBegin::Refused(reason.to_owned().into())),
             None => Ok(()),
         }
     }
@@ -91,7 +91,7 @@ impl RobotState for Robot {
     fn check_recovery(&self, _: Recovery) -> Result<JointPositions, CannotBegin> {
         match self.no_plan {
             _ if self.unrehearsed => Err(CannotBegin::NotRehearsed),
-            Some(reason) => Err(CannotBegin::Refused(reason.to_owned())),
+            Some(reason) => Err(CannotBegin::Refused(reason.to_owned().into())),
             None => Ok(JointPositions::repeat(self.joints_rad)),
         }
     }
@@ -669,7 +669,7 @@ fn the_arm_goes_home_only_by_an_approval_of_that_very_proposal() {
         proposed
             .map(|ProposalId(id)| id)
             .map_err(|cannot| match cannot {
-                CannotBegin::Refused(reason) => reason,
+                CannotBegin::Refused(obstacle) => obstacle.into(),
                 CannotBegin::NotRehearsed => "not rehearsed".to_owned(),
             })
     };
@@ -849,4 +849,107 @@ fn a_way_home_that_was_rehearsed_from_elsewhere_or_on_another_view_has_to_be_cal
     assert_refused(&gate, actions, &["50", "call for it again"]);
     let actions = decide(&mut gate, 50, approve);
     assert_refused(&gate, actions, &["50", "withdrawn"]);
+}
+
+#[test]
+fn the_reason_of_a_refusal_is_found_in_its_text() {
+    let id = ProposalId(7);
+    let stamp = Duration::from_secs(10);
+    let workspace = Box::new(Workspace::RAVENS);
+    let change = |height_m| Change {
+        area_m2: 1e-4,
+        center_m: Point2::new(0.5, 0.0),
+        height_m,
+        near: true,
+    };
+    let outside = InvalidProposal::OutsideWorkspace {
+        id,
+        which: "pick",
+        x_m: 7.0,
+        y_m: 0.0,
+        workspace,
+    };
+    let frame = InvalidProposal::Frame {
+        id,
+        actual: "camera".into(),
+        expected: "world".into(),
+    };
+    let not_finite = InvalidProposal::NotFinite {
+        id,
+        which: "place",
+        x_m: f64::NAN,
+        y_m: 0.0,
+        yaw_rad: 0.0,
+    };
+    let settings = InvalidProposal::Settings {
+        id,
+        name: "lift_m",
+        value: 7.0,
+        limit: 0.5,
+    };
+    let mut refusals: Vec<Refusal> = vec![
+        Refusal::Unknown { id },
+        Refusal::NothingToStop { id },
+        outside.into(),
+        frame.into(),
+        not_finite.into(),
+        settings.into(),
+        InvalidProposal::DifferentContents { id }.into(),
+        Refusal::Busy { id, moving: id },
+        Refusal::Homing { id },
+        Refusal::HomeFromElsewhere { id },
+        Refusal::OldObservation {
+            id,
+            stamp,
+            moved_until: stamp,
+        },
+        Refusal::NoSourceHeightmap { id, stamp },
+        Refusal::OtherWorkspace { id, stamp },
+        Refusal::ObservationChanged {
+            id,
+            stamp,
+            change: change(Some(0.02)),
+        },
+        Refusal::ObservationChanged {
+            id,
+            stamp,
+            change: change(None),
+        },
+        Refusal::NotRehearsed { id },
+        Refusal::StopCame { id },
+        Refusal::MotionBrokenOff { id },
+    ];
+    let statuses = ProposalStatus::ALL.iter().copied();
+    refusals.extend(statuses.map(|status| Refusal::NotPending { id, status }));
+    let obstacles = RefusalReason::ALL.iter().map(|reason| reason.because("7"));
+    refusals.extend(obstacles.map(|obstacle| Refusal::Robot { id, obstacle }));
+    for refusal in refusals {
+        let text = refusal.to_string();
+        assert_eq!(RefusalReason::of_text(&text), refusal.reason(), "{text}");
+    }
+    for (cause, reason) in [
+        (MotionCause::Proposal(id), RefusalReason::Busy),
+        (MotionCause::Home(id), RefusalReason::OnItsWayHome),
+        (MotionCause::PutDown(id), RefusalReason::Busy),
+    ] {
+        assert_eq!(RefusalReason::of_text(&cause.busy_text()), reason);
+    }
+}
+
+#[test]
+fn after_a_stop_a_sure_proposal_asks_too_until_the_next_approval() {
+    let rule = RequireApproval::Unsure { threshold: 0.9 };
+    let sure = Proposal {
+        success_probability: Some(0.95),
+        ..proposal(7)
+    };
+    let mut unasked = Unasked::new(rule);
+    assert!(unasked.moves(rule, &sure));
+    assert!(!unasked.moves(rule, &proposal(8)), "nothing estimates it");
+    unasked.stop();
+    assert!(!unasked.moves(rule, &sure));
+    unasked.go_on(rule);
+    assert!(unasked.moves(rule, &sure));
+    unasked.go_on(RequireApproval::Always);
+    assert!(!unasked.is_on());
 }

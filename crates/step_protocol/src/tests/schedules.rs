@@ -1,5 +1,5 @@
 //! All four machines together under random schedules: messages delayed, repeated, reordered and lost, garbage in between, any
-//! party started again, two operators, stops and faults.
+//! party started again, two operators, each a program that answers questions or a person at a page, stops and faults.
 //!
 //! `SCHEDULES=1000000 SEED=7 cargo test --release -p step_protocol schedules -- --nocapture`
 
@@ -16,11 +16,12 @@ use rand_chacha::ChaCha8Rng;
 
 use crate::mutation::{Mutation, plant};
 use crate::{
-    ApprovalGate, CannotBegin, Change, Confirmation, Coverage, GateAction, GateRules, Goal,
-    GoalSequence, GoalTracker, Job, JointPositions, Judgement, Observation, Operator,
-    OperatorDecision, PlannerRules, Prediction, Proposal, ProposalId, ProposalPlanner,
-    ProposalStatus, Proposed, Question, Recovery, RequireApproval, Reward, RobotState, ShownStep,
-    StepJudge, StepOutcome, StepResult, goals_of,
+    ApprovalGate, CannotBegin, Change, Confirmation, ConfirmationRefusal, Coverage, GateAction,
+    GateRules, Goal, GoalSequence, GoalTracker, Job, JointPositions, Judgement, Observation,
+    Obstacle, Operator, OperatorDecision, PlannerRules, Prediction, Proposal, ProposalId,
+    ProposalPlanner, ProposalStatus, Proposed, Question, Recovery, RefusalKind, RefusalReason,
+    RequireApproval, Reward, RobotState, RunPhase, ShownStep, StepJudge, StepOutcome, StepResult,
+    goals_of,
 };
 
 const WORKSPACE: Workspace = Workspace {
@@ -38,7 +39,7 @@ const INBOX: usize = 24;
 /// Actions of a schedule.
 const ACTIONS: usize = 48;
 /// A run that has not ended after so many quiet moments hangs.
-const QUIET_MOMENTS: usize = 60;
+const QUIET_MOMENTS: usize = 200;
 
 /// Who receives messages.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -64,6 +65,7 @@ enum Message {
     /// A message of this id that cannot be read is `Err`.
     Proposal(ProposalId, Result<Proposal, String>),
     Confirmation(Confirmation),
+    ConfirmationRefused(ProposalId, RefusalKind),
     Result(StepResult),
     Reward(Reward),
 }
@@ -93,6 +95,8 @@ enum Action {
     Observe(usize),
     /// An operator decides without being asked, on a proposal that was published or on none.
     Decide(usize, usize, usize),
+    /// The person at a page looks at it, and decides what it asks, so or so.
+    Look(usize, usize),
     /// Somebody else publishes a proposal.
     Foreign(usize),
     /// Time goes by.
@@ -121,9 +125,10 @@ impl Action {
             60 => Self::Deactivate,
             61..67 => Self::Predict,
             67..70 => Self::Rehearse,
-            70..79 => Self::EndMotion(which),
-            79..85 => Self::Observe(which),
-            85..91 => Self::Decide(party, which, other),
+            70..77 => Self::EndMotion(which),
+            77..82 => Self::Observe(which),
+            82..87 => Self::Look(party, which),
+            87..91 => Self::Decide(party, which, other),
             91..94 => Self::Foreign(which),
             94..96 => Self::Tick,
             96 => Self::SetStep(which),
@@ -158,8 +163,8 @@ struct Robot {
 }
 
 impl RobotState for Robot {
-    fn obstacle(&self) -> Option<String> {
-        (!self.ready).then(|| "protective stop".to_owned())
+    fn obstacle(&self) -> Option<Obstacle> {
+        (!self.ready).then(|| RefusalReason::SafetyMode.because("is PROTECTIVE_STOP"))
     }
 
     fn check_motion(&self, proposal: &Proposal) -> Result<(), CannotBegin> {
@@ -187,6 +192,8 @@ struct World {
     planner: ProposalPlanner,
     gate: ApprovalGate,
     operators: [Operator; 2],
+    /// Which of them are people at a page.
+    at_page: [bool; 2],
     inboxes: [VecDeque<Message>; 5],
     job: Option<Job>,
     robot: Robot,
@@ -290,12 +297,18 @@ fn predict(job: &Job) -> Result<Prediction, String> {
 }
 
 impl World {
-    fn new(clock_runs: bool) -> Self {
+    fn new(
+        Setting {
+            clock_runs,
+            at_page,
+        }: Setting,
+    ) -> Self {
         let mut world = Self {
             tracker: tracker(),
             planner: planner(),
             gate: gate(),
-            operators: [Operator::new(true), Operator::new(true)],
+            operators: at_page.map(|at_page| Operator::new(!at_page)),
+            at_page,
             inboxes: Default::default(),
             job: None,
             robot: Robot {
@@ -340,7 +353,8 @@ impl World {
             Message::Heightmap(_) => &[Planner, Gate],
             Message::Goal(_) => &[Planner, Operator(0), Operator(1)],
             Message::Proposal(..) => &[Tracker, Gate, Operator(0), Operator(1)],
-            Message::Confirmation(_) => &[Tracker, Planner, Gate],
+            Message::Confirmation(_) => &[Tracker, Planner, Gate, Operator(0), Operator(1)],
+            Message::ConfirmationRefused(..) => &[Operator(0), Operator(1)],
             Message::Result(_) => &[Tracker, Planner, Operator(0), Operator(1)],
             Message::Reward(_) => &[Operator(0), Operator(1)],
         };
@@ -420,7 +434,9 @@ impl World {
                     self.move_scene(0.0);
                 }
             }
-            Party::Operator(index) => self.operators[index] = Operator::new(true),
+            Party::Operator(index) => {
+                self.operators[index] = Operator::new(!self.at_page[index]);
+            }
         }
         self.send_latched(party);
     }
@@ -447,31 +463,89 @@ impl World {
                     Message::Proposal(_, Ok(proposal)) => operator.on_proposal(proposal),
                     Message::Result(result) => operator.on_result(result),
                     Message::Reward(reward) => operator.on_reward(reward),
+                    Message::Confirmation(confirmation) => {
+                        operator.on_confirmation(&confirmation, self.now);
+                        None
+                    }
+                    Message::ConfirmationRefused(id, kind) => {
+                        operator.on_confirmation_refused(id, Some(kind));
+                        None
+                    }
                     _ => None,
                 };
-                question
-                    .into_iter()
-                    .for_each(|question| self.answer(index, &question));
+                if let Some(question) = question
+                    && !self.at_page[index]
+                {
+                    self.answer(index, &question);
+                }
                 Ok(())
             }
         }
     }
 
     fn answer(&mut self, operator: usize, question: &Question) {
-        self.confirm(
+        self.decide(
             operator,
             question.proposal_id(),
             question.automatic_answer(),
         );
     }
 
-    fn confirm(&mut self, operator: usize, id: ProposalId, decision: OperatorDecision) {
-        self.publish(Message::Confirmation(Confirmation {
+    fn decide(&mut self, operator: usize, id: ProposalId, decision: OperatorDecision) {
+        let confirmation = Confirmation {
             stamp: self.now,
             proposal_id: id,
             decision,
             operator_name: format!("operator {operator}"),
-        }));
+        };
+        self.operators[operator].decide(&confirmation, self.now);
+        self.publish(Message::Confirmation(confirmation));
+    }
+
+    /// The page asks again by itself what was not answered.
+    fn refresh(&mut self, index: usize) {
+        let operator = &mut self.operators[index];
+        if self.motion.is_some() {
+            operator.on_motion(self.now);
+        }
+        operator.ask_again(self.now);
+        if let Some(id) = operator.probe(self.now) {
+            self.decide(index, id, OperatorDecision::Reject);
+        }
+    }
+
+    /// The person at the page decides what it asks: as it should be, or on a whim.
+    fn look(&mut self, index: usize, whim: usize) -> Check {
+        let operator = &self.operators[index];
+        let Some(id) = operator.current().map(|proposal| proposal.id) else {
+            return self.continue_run(index);
+        };
+        let is_planned = self.robot.rehearsed == Some(id);
+        let decision = match (operator.phase(), whim % 8) {
+            (RunPhase::Proposed, 1) => OperatorDecision::Reject,
+            (RunPhase::Proposed | RunPhase::Moving, 2) => OperatorDecision::Stop,
+            (RunPhase::Proposed, _) if is_planned => OperatorDecision::Approve,
+            // Its motion is shown soon; in the end the person wants another one.
+            (RunPhase::Proposed, _) if self.fair => OperatorDecision::Reject,
+            (RunPhase::AwaitingConfirmation | RunPhase::Fault, 1..4) => OperatorDecision::Retry,
+            (RunPhase::AwaitingConfirmation | RunPhase::Fault, _) => OperatorDecision::Advance,
+            _ => return self.continue_run(index),
+        };
+        self.decide(index, id, decision);
+        Ok(())
+    }
+
+    /// The person has a run that the page shows as stopped go on with the present step.
+    fn continue_run(&mut self, index: usize) -> Check {
+        if self.operators[index].phase() != RunPhase::Stopped {
+            return Ok(());
+        }
+        let (step, _, _) = self.tracker.progress();
+        if let Ok(change) = self.tracker.set_step(step) {
+            self.operators[index].on_continued();
+            self.after_tracker(change, None)?;
+        }
+        Ok(())
     }
 
     fn tracker_receives(&mut self, message: Message) -> Check {
@@ -505,9 +579,12 @@ impl World {
             Message::Confirmation(confirmation) => {
                 let id = confirmation.proposal_id;
                 let judgement = Judgement::from_decision(confirmation.decision);
-                let Ok(change) = self.tracker.on_confirmation(&confirmation) else {
-                    // Refused, and told so.
-                    return self.after_tracker(Change::None, None);
+                let change = match self.tracker.on_confirmation(&confirmation) {
+                    Ok(change) => change,
+                    Err(refusal) => {
+                        self.publish_refusal(id, &refusal);
+                        return self.after_tracker(Change::None, None);
+                    }
                 };
                 match (judgement, &change) {
                     (Some(judgement), Change::Goal(_)) => {
@@ -558,7 +635,8 @@ impl World {
 
     /// `moved`: the tracker has been told of the motion for this proposal.
     fn after_tracker(&mut self, change: Change, moved: Option<ProposalId>) -> Check {
-        for (id, _) in self.tracker.take_refused() {
+        for (id, refusal) in self.tracker.take_refused() {
+            self.publish_refusal(id, &refusal);
             if self.queued.remove(&id).is_none() {
                 return violation(format!("a decision on {id} was refused that did not wait"));
             }
@@ -574,6 +652,10 @@ impl World {
             self.publish_goal();
         }
         Ok(())
+    }
+
+    fn publish_refusal(&mut self, id: ProposalId, refusal: &ConfirmationRefusal) {
+        self.publish(Message::ConfirmationRefused(id, refusal.kind()));
     }
 
     fn planner_receives(&mut self, message: Message) -> Check {
@@ -971,11 +1053,27 @@ impl World {
                 let home = self.homes.iter().rev().nth(which / 2 % 2).copied();
                 let id = home.filter(|_| which % 2 == 0).or(id);
                 let decision = OperatorDecision::ALL[decision % 6];
-                self.confirm(number % 2, id.unwrap_or(unknown), decision);
+                // At a terminal: who sits at a page hears of it.
+                self.publish(Message::Confirmation(Confirmation {
+                    stamp: self.now,
+                    proposal_id: id.unwrap_or(unknown),
+                    decision,
+                    operator_name: format!("terminal {}", number % 2),
+                }));
+            }
+            Action::Look(number, whim) => {
+                if self.at_page[number % 2] {
+                    return self.look(number % 2, whim);
+                }
             }
             Action::Foreign(kind) => self.foreign(kind),
             Action::Tick => {
                 self.now += GRACE;
+                for index in 0..2 {
+                    if self.at_page[index] {
+                        self.refresh(index);
+                    }
+                }
                 return self.ask_gate();
             }
             Action::SetStep(step) => {
@@ -1037,6 +1135,11 @@ impl World {
             self.publish(Message::Heightmap(self.seen.clone()));
             self.settle()?;
             for index in 0..2 {
+                if self.at_page[index] {
+                    self.refresh(index);
+                    self.look(index, 0)?;
+                    continue;
+                }
                 for question in self.operators[index].on_silence() {
                     self.answer(index, &question);
                 }
@@ -1095,8 +1198,28 @@ fn schedule(seed: u64) -> Vec<Action> {
     (0..count).map(|_| Action::random(&mut rng)).collect()
 }
 
-fn run(actions: &[Action], clock_runs: bool) -> Check {
-    let mut world = World::new(clock_runs);
+/// What is the same all through a schedule.
+#[derive(Clone, Copy, Debug)]
+struct Setting {
+    clock_runs: bool,
+    at_page: [bool; 2],
+}
+
+impl Setting {
+    fn of(seed: u64) -> Self {
+        Self {
+            clock_runs: seed.is_multiple_of(2),
+            at_page: match seed / 2 % 4 {
+                0 | 1 => [false, false],
+                2 => [false, true],
+                _ => [true, true],
+            },
+        }
+    }
+}
+
+fn run(actions: &[Action], setting: Setting) -> Check {
+    let mut world = World::new(setting);
     for action in actions {
         world.perform(*action)?;
     }
@@ -1104,7 +1227,7 @@ fn run(actions: &[Action], clock_runs: bool) -> Check {
 }
 
 /// The shortest part of a schedule, found by leaving out ever smaller pieces, that still goes wrong.
-fn shrunk(mut actions: Vec<Action>, clock_runs: bool) -> (Vec<Action>, Violation) {
+fn shrunk(mut actions: Vec<Action>, setting: Setting) -> (Vec<Action>, Violation) {
     let mut found = Violation(String::new());
     let mut piece = actions.len().max(1);
     loop {
@@ -1112,7 +1235,7 @@ fn shrunk(mut actions: Vec<Action>, clock_runs: bool) -> (Vec<Action>, Violation
         while start < actions.len() {
             let end = (start + piece).min(actions.len());
             let shorter = [&actions[..start], &actions[end..]].concat();
-            match run(&shorter, clock_runs) {
+            match run(&shorter, setting) {
                 Err(violation) => {
                     found = violation;
                     actions = shorter;
@@ -1125,7 +1248,7 @@ fn shrunk(mut actions: Vec<Action>, clock_runs: bool) -> (Vec<Action>, Violation
         }
         piece /= 2;
     }
-    if let Err(violation) = run(&actions, clock_runs) {
+    if let Err(violation) = run(&actions, setting) {
         found = violation;
     }
     (actions, found)
@@ -1135,12 +1258,12 @@ fn shrunk(mut actions: Vec<Action>, clock_runs: bool) -> (Vec<Action>, Violation
 fn first_violation(seed: u64, count: u64) -> Option<(u64, String)> {
     (seed..seed + count).find_map(|seed| {
         let actions = schedule(seed);
-        let clock_runs = seed % 2 == 0;
-        run(&actions, clock_runs).err()?;
-        let (actions, violation) = shrunk(actions, clock_runs);
+        let setting = Setting::of(seed);
+        run(&actions, setting).err()?;
+        let (actions, violation) = shrunk(actions, setting);
         let actions: Vec<_> = actions.iter().map(|action| format!("{action:?}")).collect();
         let actions = actions.join("\n    ");
-        let text = format!("seed {seed}, clock runs: {clock_runs}: {violation}\n    {actions}");
+        let text = format!("seed {seed}, {setting:?}: {violation}\n    {actions}");
         Some((seed, text))
     })
 }

@@ -115,7 +115,7 @@ impl Executor<'_> {
                 }
                 Err(cannot) => {
                     let reason = match cannot {
-                        CannotBegin::Refused(reason) => reason,
+                        CannotBegin::Refused(obstacle) => obstacle.into(),
                         CannotBegin::NotRehearsed => {
                             "the arm, what is held or what is seen has changed meanwhile: call again".to_owned()
                         }

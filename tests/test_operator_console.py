@@ -24,9 +24,11 @@ import urllib.request
 from collections.abc import Callable, Iterator
 from typing import Any
 
+import numpy as np
 import pytest
 import teaching
 from browser import PATIENCE_MS, Person, address_of, chromium, launched, no_barrier
+from cameras import LENSES, through_lens
 from cell_operator import EVENT, Operator, nanoseconds
 from playwright.sync_api import Browser, Locator, expect
 from processes import REPOSITORY, Process
@@ -951,3 +953,17 @@ def test_hostile_input_moves_nothing_and_the_page_works_on(start, decided) -> No
     console.wait("awaiting_confirmation")
     until(decided, "decision on the graph", 30.0)
     assert [one.decision for one in decided()] == [StepConfirmation.APPROVE]
+
+
+@pytest.mark.parametrize("model", LENSES)
+def test_the_page_draws_through_every_lens_as_it_is_documented(browser: Browser, model: str) -> None:
+    source = (REPOSITORY / "console/page/cameras.js").read_text()
+    through = re.search(r"^function throughLens.*?^}$", source, re.MULTILINE | re.DOTALL).group(0)
+    points = [[0.1, 0.2], [-0.4, 0.3], [0.6, -0.5], [0.01, 0.0]]
+    page = browser.new_page()
+    shown = page.evaluate(
+        f"([d, points]) => {{ {through}; return points.map(([x, y]) => throughLens('{model}', d, x, y)); }}", [LENSES[model], points]
+    )
+    page.close()
+    expected = through_lens(model, *np.array(points).T)
+    assert np.allclose(np.array(shown).T, expected, atol=1e-12)

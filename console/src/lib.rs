@@ -12,6 +12,7 @@
 //! let run = Run::new(Watch {
 //!     nodes: vec!["/suction_executor".into()],
 //!     executor: "/suction_executor".into(),
+//!     image_topics: vec!["color/image_raw".into(), "depth/image_rect_raw".into()],
 //!     stale_after: Duration::from_secs(3),
 //!     changes: heightmap::ChangeRules::default(),
 //! });

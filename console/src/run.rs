@@ -74,6 +74,8 @@ pub struct Watch {
     pub nodes: Vec<String>,
     /// Full name of the executor, one of them.
     pub executor: String,
+    /// Endings of the topics of the cameras' images.
+    pub image_topics: Vec<String>,
     /// Age from which a stream is stale.
     pub stale_after: Duration,
     /// A proposal is stale when the table has changed by these since the heightmap that it was made from.

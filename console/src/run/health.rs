@@ -76,7 +76,10 @@ impl Run {
             health.states.clear();
             health.images.clear();
             for (topic, line) in values {
-                if let Some(age_s) = image_age(&topic, &line) {
+                let mut endings = self.watch.image_topics.iter();
+                if endings.any(|ending| topic.ends_with(ending))
+                    && let Some(age_s) = heard_age(&line)
+                {
                     health.images.insert(topic, age_s);
                 }
             }
@@ -167,11 +170,8 @@ impl Run {
     }
 }
 
-/// The age that a node's diagnostics give for an image topic that it hears.
-fn image_age(topic: &str, line: &str) -> Option<Option<f64>> {
-    if !(topic.ends_with("/image_raw") || topic.ends_with("/image_rect_raw")) {
-        return None;
-    }
+/// The age that a node's diagnostics give for a topic that it hears.
+fn heard_age(line: &str) -> Option<Option<f64>> {
     let words = line.strip_prefix("in ")?.split_whitespace();
     let age = words
         .filter_map(|word| word.strip_prefix("age_s="))

@@ -97,6 +97,12 @@ impl Board {
         )
     }
 
+    /// The middle of the board in its frame.
+    pub fn middle(&self) -> Point3<f64> {
+        let half = |count: usize| 0.5 * (count as f64 * (self.tag_m + self.gap_m) - self.gap_m);
+        Point3::new(half(self.cols), half(self.rows), 0.0)
+    }
+
     /// Whether the board is white at a point of its plane. None beyond its edge, half a gap (and at least a module) around the tags.
     pub fn is_white(&self, x_m: f64, y_m: f64) -> Option<bool> {
         let pitch_m = self.tag_m + self.gap_m;

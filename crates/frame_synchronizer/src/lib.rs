@@ -2,6 +2,7 @@
 //! whatever a driver sends, and is decoded only when it is fused.
 
 mod camera_state;
+mod depth_reader;
 
 use std::collections::{BTreeMap, VecDeque};
 use std::fmt::Display;
@@ -14,6 +15,8 @@ use heightmap::{
 use nalgebra::Isometry3;
 
 use self::camera_state::CameraState;
+
+pub use self::depth_reader::{Calibration, ColorImage, DepthReader};
 
 /// Images of one stream that wait for their counterparts.
 const WAITING_IMAGES: usize = 4;

@@ -63,6 +63,11 @@ pub async fn configure(
             .map(|name| node.resolve(name))
             .collect(),
         executor: node.resolve(&parameters.executor),
+        image_topics: parameters
+            .camera_preset
+            .image_endings()
+            .map(str::to_owned)
+            .into(),
         stale_after: Duration::from_secs_f64(parameters.stale_after_s),
         changes: heightmap::ChangeRules::new(
             parameters.observation_tolerance_m,
@@ -307,7 +312,8 @@ impl ConsoleNode {
             .iter()
             .filter(|name| !name.is_empty())
         {
-            let images = cameras::follow(node.clone(), cameras(), name.clone());
+            let topics = self.parameters.camera_preset.topics(name);
+            let images = cameras::follow(node.clone(), cameras(), name.clone(), topics);
             watch(format!("camera {name}"), Box::pin(images));
         }
     }

@@ -4,6 +4,7 @@ use std::net::{IpAddr, SocketAddr};
 use std::path::{Path, PathBuf};
 
 use console::Access;
+use msgs::CameraPreset;
 use node_kit::{InvalidParameter, Parameters, Range};
 use serde::{Deserialize, Serialize};
 
@@ -32,6 +33,7 @@ pub struct OperatorConsoleParameters {
     pub training: PathBuf,
     pub nodes: Vec<String>,
     pub cameras: Vec<String>,
+    pub camera_preset: CameraPreset,
     pub world_frame: String,
     pub executor: String,
     pub goal_oracle: String,
@@ -81,6 +83,7 @@ impl Default for OperatorConsoleParameters {
                 "suction_executor",
             ]),
             cameras: names(&["front", "left", "right"]),
+            camera_preset: CameraPreset::Simulated,
             world_frame: "world".into(),
             executor: "suction_executor".into(),
             goal_oracle: "goal_oracle".into(),

@@ -39,7 +39,8 @@ pub use invalid_parameter::InvalidParameter;
 pub use lifecycle::{Active, LifecycleClient, LifecycleError, State, Transition};
 pub use node::{Node, NodeError};
 pub use parameters::{
-    Loaded, NoParameters, ParameterError, Parameters, Range, load_text, mistakes_in_documentation,
+    Loaded, NoParameters, ParameterError, Parameters, Range, load as load_parameters, load_text,
+    mistakes_in_documentation,
 };
 pub use plain::plain_node;
 pub use qos::Qos;

@@ -32,6 +32,7 @@ use self::streams::follow_status;
 pub use self::exclusion::{ActivateError, ActiveExecutor};
 pub use self::heartbeat::Heartbeat;
 pub use self::parameters::DriverParameters;
+pub use self::readiness::driver_obstacle;
 pub use self::robot::DriverRobot;
 
 /// Why the robot does not go on. Suction stays as it is: holding is safer than dropping.

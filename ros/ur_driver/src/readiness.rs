@@ -107,6 +107,24 @@ pub(crate) fn watch_readiness(
     Ok(receiver)
 }
 
+/// Asks the driver whether it has what the executor needs: what is missing, by name; nothing where all is there. A driver that does not answer
+/// within `patience` is asked no more.
+///
+/// # Errors
+/// A name in the parameters is not a ROS name, or the middleware refuses.
+pub async fn driver_obstacle(
+    node: &Node,
+    driver: &DriverParameters,
+    patience: Duration,
+) -> Result<Option<String>, NodeError> {
+    let mut readiness = watch_readiness(node, driver)?;
+    let checked = readiness.wait_for(|found| !matches!(found, Readiness::Unchecked(_)));
+    if let Ok(Ok(found)) = tokio::time::timeout(patience, checked).await {
+        return Ok(found.obstacle());
+    }
+    Ok(readiness.borrow().obstacle())
+}
+
 impl Checks {
     async fn check(&mut self) -> Readiness {
         let options = CallOptions {

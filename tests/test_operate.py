@@ -9,10 +9,10 @@ import pytest
 from campaign_cell import arguments
 from cell_operator import STREAM, Operator
 from processes import Process
-from rclpy.action import ActionClient
-from sctn_msgs.action import ExecutePickPlace
 from rcl_interfaces.srv import SetParameters
+from rclpy.action import ActionClient
 from rclpy.parameter import Parameter
+from sctn_msgs.action import ExecutePickPlace
 from sctn_msgs.msg import PickPlace, StepConfirmation, StepResult
 from test_hardware import DISK, VACUUM_PIN, look_at, look_at_disk, propose, wait_until_moving
 from test_refusals import Cell

@@ -106,7 +106,15 @@ def test_on_a_real_cell_a_file_of_the_engineer_wins_and_a_stop_is_remembered() -
 
 
 def test_a_real_cell_has_a_median_and_the_topics_of_its_cameras_in_fusion_page_and_check() -> None:
-    launch = Launch(REAL_CELL, camera_preset="orbbec", frames="7", calibration="/cell/calibration.yaml", contact="vacuum", namespace="cell")
+    launch = Launch(
+        REAL_CELL,
+        camera_preset="orbbec",
+        frames="7",
+        calibration="/cell/calibration.yaml",
+        arm_calibration="/cell/arm.yaml",
+        contact="vacuum",
+        namespace="cell",
+    )
     given = {
         node["executable"]: node["parameters"][2]
         for node in (entity.named for entity in launch.entities if kind(entity) == "Node")
@@ -123,6 +131,7 @@ def test_a_real_cell_has_a_median_and_the_topics_of_its_cameras_in_fusion_page_a
         ["-p", "camera_fusion:camera_preset:=orbbec"],
         ["-p", 'camera_fusion:calibration:="/cell/calibration.yaml"'],
         ["-p", "suction_executor:driver.contact:=vacuum"],
+        ["-p", 'suction_executor:arm_calibration:="/cell/arm.yaml"'],
         ["-r", "__ns:=/cell"],
     ):
         at = check.index(words[1])
@@ -141,7 +150,7 @@ def test_the_executor_of_a_real_cell_starts_only_when_the_check_has_found_nothin
     assert unchecked.after(0) == []
     [at_once] = [entity for entity in unchecked.entities if kind(entity) == "Node" and entity.named["executable"] == "suction_executor"]
     assert launch.text(started[0].named["parameters"][0]) == unchecked.text(at_once.named["parameters"][0])
-    assert set(started[0].named["parameters"][1]) == set(at_once.named["parameters"][1])
+    assert set(started[0].named["parameters"][2]) == set(at_once.named["parameters"][2])
     for returncode in (1, 2, 101, -9):
         [said] = launch.after(returncode)
         assert kind(said) == "LogInfo"

@@ -20,7 +20,7 @@ use std::process::ExitCode;
 use std::time::Duration;
 use suction_executor::SuctionExecutorParameters;
 use ur_driver::{DriverParameters, driver_obstacle};
-use ur5::{Arm, ArmCalibration, WorkCell};
+use ur5::{Arm, WorkCell};
 
 /// Arguments of `sctn check`: the arm out of sight, the table empty but for the board of `sctn calibrate`, which may lie there.
 ///
@@ -60,7 +60,7 @@ pub struct Check {
     /// The cell [default: urdf/workcell.urdf]
     #[arg(long, value_name = "FILE")]
     urdf: Option<PathBuf>,
-    /// Factory calibration of the arm, as the UR driver's ur_calibration writes it
+    /// Factory calibration of the arm, as the UR driver's ur_calibration writes it [default: the parameter of suction_executor]
     #[arg(long, value_name = "FILE")]
     arm_calibration: Option<PathBuf>,
     /// Print a JSON object last
@@ -127,6 +127,8 @@ impl From<&Measure> for Row {
 struct Settings {
     fusion: CameraFusionParameters,
     driver: DriverParameters,
+    /// Factory calibration of the arm; empty for none.
+    arm_calibration: PathBuf,
     /// Of the topics; empty or /cell.
     namespace: String,
 }
@@ -214,11 +216,10 @@ impl Check {
             None => root.work_cell()?,
             Some(path) => WorkCell::load(path)?,
         };
-        let cell = match &self.arm_calibration {
-            None => cell,
-            Some(path) => cell.with_calibration(&ArmCalibration::load(path)?)?,
-        };
         let settings = self.settings(root)?;
+        let arm_calibration = self.arm_calibration.as_ref();
+        let cell =
+            cell.with_calibration_file(arm_calibration.unwrap_or(&settings.arm_calibration))?;
         let mut of_driver = None;
         let measures = match &self.bag {
             Some(path) => self.measure(path, &cell, &settings)?,
@@ -292,9 +293,11 @@ impl Check {
         let node = "suction_executor";
         let executor =
             load_parameters::<SuctionExecutorParameters>(&sources(node), node, &full(node));
+        let executor = executor.context(node)?.parameters;
         Ok(Settings {
             fusion,
-            driver: executor.context(node)?.parameters.driver,
+            driver: executor.driver,
+            arm_calibration: executor.arm_calibration,
             namespace,
         })
     }

@@ -62,6 +62,7 @@ def generate_launch_description() -> LaunchDescription:
             *("-p", ["camera_fusion:camera_preset:=", LaunchConfiguration("camera_preset")]),
             *("-p", ['camera_fusion:calibration:="', LaunchConfiguration("calibration"), '"']),
             *("-p", ["suction_executor:driver.contact:=", LaunchConfiguration("contact")]),
+            *("-p", ['suction_executor:arm_calibration:="', LaunchConfiguration("arm_calibration"), '"']),
             *("--params-file", LaunchConfiguration("parameters")),
         ],
         condition=IfCondition(LaunchConfiguration("check")),

@@ -10,7 +10,6 @@ use std::time::Duration;
 use anyhow::{Context as _, Result, ensure};
 use bags::BagReader;
 use clap::Args;
-use heightmap::Heightmap;
 use heightmap::picture::{self, RgbImage};
 use image::codecs::gif::{GifEncoder, Repeat};
 use image::imageops::{self, FilterType};

@@ -4,7 +4,6 @@ use anyhow::{Context as _, Result};
 use clap::ValueEnum;
 use msgs::{convert, sctn_msgs};
 use node_kit::Node;
-use std::time::Duration;
 use step_protocol::{Confirmation, OperatorDecision, Proposal, ProposalId, Question, Verdict};
 
 /// Which proposals an operator approves before they are carried out.
@@ -134,6 +133,8 @@ pub fn confirmation(
 
 #[cfg(test)]
 mod tests {
+    use std::time::Duration;
+
     use nalgebra::Isometry2;
     use pick_place::{PickPlace, PrimitiveSettings};
 

@@ -91,7 +91,7 @@ impl Run {
             Some(source) => {
                 let action = &proposal.action;
                 let around =
-                    [&action.pick, &action.place].map(|pose| pose.translation.vector.into());
+                    [&action.pick, &action.place].map(|pose| Point2::from(pose.translation.vector));
                 table_change(source, newest, &self.watch.changes, &around)
             }
             None => before.and_then(|known| known.change),

@@ -478,9 +478,9 @@ mod tests {
         fn up_to_the_fold_what_is_further_out_is_shown_further_out(
             lens in lens(), share in 0.0..0.999, further in 1.0001..1.5,
         ) {
-            let end = lens.fold.min(WIDEST).sqrt();
+            let end: f64 = lens.fold.min(WIDEST).sqrt();
             let shown = |radius: f64| radius * lens.radial.factor(radius * radius).0;
-            let radius = share * end;
+            let radius: f64 = share * end;
             prop_assert!(shown((radius * further).min(end)) >= shown(radius) - 1e-12);
             // And not a bit further.
             if lens.fold < WIDEST {

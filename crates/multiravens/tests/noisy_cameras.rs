@@ -129,6 +129,7 @@ impl Executor {
             pick_score: 1.0,
             place_score: 1.0,
             success_probability: None,
+            done_probability: None,
             checkpoint: String::new(),
             author: "demonstrator".into(),
         };

@@ -476,11 +476,11 @@ mod tests {
 
         #[test]
         fn up_to_the_fold_what_is_further_out_is_shown_further_out(
-            lens in lens(), share in 0.0..0.999, further in 1.0001..1.5,
+            lens in lens(), share in 0.0f64..0.999, further in 1.0001f64..1.5,
         ) {
-            let end: f64 = lens.fold.min(WIDEST).sqrt();
+            let end = lens.fold.min(WIDEST).sqrt();
             let shown = |radius: f64| radius * lens.radial.factor(radius * radius).0;
-            let radius: f64 = share * end;
+            let radius = share * end;
             prop_assert!(shown((radius * further).min(end)) >= shown(radius) - 1e-12);
             // And not a bit further.
             if lens.fold < WIDEST {

@@ -23,6 +23,7 @@ mod qos;
 mod qos_overrides;
 mod raw;
 mod reply_cache;
+mod security;
 mod service;
 mod statistics;
 mod task_group;
@@ -49,6 +50,7 @@ pub use raw::{
     AsBytes, NoCdr, Offer, PublisherId, RawMessage, RawPublisher, RawQos, RawSubscription,
 };
 pub use reply_cache::ReplyCache;
+pub use security::SecurityError;
 pub use service::{CallError, CallOptions, RequestId, ServiceClient, ServiceServer};
 pub use statistics::{Snapshot, Statistics};
 pub use task_group::TaskGroup;

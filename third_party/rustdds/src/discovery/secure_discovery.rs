@@ -43,7 +43,7 @@ use crate::{
     guid::{EntityId, GuidPrefix},
   },
   with_key::{self, DataWriterCdr},
-  RepresentationIdentifier, SequenceNumber, GUID,
+  RepresentationIdentifier, SequenceNumber, Timestamp, GUID,
 };
 use super::{
   discovery::{DataWriterPlCdr, NormalDiscoveryPermission},
@@ -879,7 +879,7 @@ impl SecureDiscovery {
 
     if do_secure_write {
       let sec_sub_data = SubscriptionBuiltinTopicDataSecure::from((*local_user_reader).clone());
-      if let Err(e) = secure_sub_writer.write(sec_sub_data, None) {
+      if let Err(e) = secure_sub_writer.write(sec_sub_data, Some(Timestamp::now())) {
         error!("Failed to write subscription to DCPSSubscriptionsSecure: {e}");
       } else {
         security_info!(
@@ -890,7 +890,9 @@ impl SecureDiscovery {
       }
     } else {
       // Do a non-secure write
-      if let Err(e) = nonsecure_sub_writer.write((*local_user_reader).clone(), None) {
+      if let Err(e) =
+        nonsecure_sub_writer.write((*local_user_reader).clone(), Some(Timestamp::now()))
+      {
         error!("Failed to write subscription to DCPSSubscriptions: {e}");
       } else {
         debug!(
@@ -922,7 +924,7 @@ impl SecureDiscovery {
 
     if do_secure_write {
       let sec_pub_data = PublicationBuiltinTopicDataSecure::from((*local_user_writer).clone());
-      if let Err(e) = secure_pub_writer.write(sec_pub_data, None) {
+      if let Err(e) = secure_pub_writer.write(sec_pub_data, Some(Timestamp::now())) {
         error!("Failed to write publication to DCPSPublicationsSecure: {e}");
       } else {
         security_info!(
@@ -933,7 +935,9 @@ impl SecureDiscovery {
       }
     } else {
       // Do a non-secure write
-      if let Err(e) = nonsecure_pub_writer.write((*local_user_writer).clone(), None) {
+      if let Err(e) =
+        nonsecure_pub_writer.write((*local_user_writer).clone(), Some(Timestamp::now()))
+      {
         error!("Failed to write publication to DCPSPublications: {e}");
       } else {
         debug!(
@@ -1913,7 +1917,25 @@ impl SecureDiscovery {
     }
   }
 
-  pub fn volatile_message_secure_read(&mut self, msg: &ParticipantVolatileMessageSecure) {
+  // `sender` is the participant whose keys the message was protected with.
+  pub fn volatile_message_secure_read(
+    &mut self,
+    msg: &ParticipantVolatileMessageSecure,
+    sender: GuidPrefix,
+  ) {
+    // A participant gives its own keys only. Else anybody with a certificate could
+    // replace the keys of another one, and speak as that one.
+    let source_endpoint = msg.generic.source_endpoint_guid;
+    if msg.generic.source_guid_prefix() != sender
+      || (source_endpoint != GUID::GUID_UNKNOWN && source_endpoint.prefix != sender)
+    {
+      security_warn!(
+        "Participant {sender:?} sent keys of {:?} and {source_endpoint:?}. Ignoring them.",
+        msg.generic.source_guid_prefix()
+      );
+      return;
+    }
+
     // Check is the message meant to us (see 7.4.4.4 Destination of the
     // ParticipantVolatileMessageSecure of the spec)
     let dest_guid = msg.generic.destination_participant_guid;

@@ -32,7 +32,7 @@ use super::{
     parse_signature_algo_name_to_ring, BuiltinAuthenticatedPeerCredentialToken,
     BuiltinIdentityToken, DH_MODP_KAGREE_ALGO_NAME, ECDH_KAGREE_ALGO_NAME,
     QOS_IDENTITY_CA_PROPERTY_NAME, QOS_IDENTITY_CERTIFICATE_PROPERTY_NAME,
-    QOS_PASSWORD_PROPERTY_NAME, QOS_PRIVATE_KEY_PROPERTY_NAME,
+    QOS_PRIVATE_KEY_PROPERTY_NAME,
   },
   BuiltinHandshakeState, DHKeys, LocalParticipantInfo, RemoteParticipantInfo,
 };
@@ -40,8 +40,7 @@ use super::{
 // GUID start from certificate subject name, as dictated in DDS Security spec
 // v1.1 Section "9.3.3 DDS:Auth:PKI-DH plugin behavior", Table 52
 fn guid_start_from_certificate(identity_cert: &Certificate) -> SecurityResult<[u8; 6]> {
-  let subject_name_der = identity_cert.subject_name_der()?;
-  let subject_name_der_hash = Sha256::hash(&subject_name_der);
+  let subject_name_der_hash = Sha256::hash(identity_cert.subject_name_der());
 
   // slice and unwrap will succeed, because input size is static
   // Procedure: Take beginning (8 bytes) from subject name DER hash, convert to
@@ -116,67 +115,29 @@ impl Authentication for AuthenticationBuiltin {
     // * performing verify and sign operations with this participant's private key
     // * accessing the participant GUID (candidate or adjusted??)
 
-    //TODO: These loading code snippets are too cut-and-paste. Copied from access
-    // control.
-    let identity_ca = participant_qos
-      .get_property(QOS_IDENTITY_CA_PROPERTY_NAME)
-      .and_then(|certificate_uri| {
-        read_uri(&certificate_uri).map_err(|conf_err| {
-          create_security_error_and_log!(
-            "Failed to read the identity CA certificate from {}: {:?}",
-            certificate_uri,
-            conf_err
-          )
-        })
-      })
-      .and_then(|certificate_contents_pem| {
-        Certificate::from_pem(certificate_contents_pem)
-          .map_err(|e| create_security_error_and_log!("{e:?}"))
-      })?;
+    let identity_ca = read_certificate(participant_qos, QOS_IDENTITY_CA_PROPERTY_NAME)?;
 
-    let identity_certificate = participant_qos
-      .get_property(QOS_IDENTITY_CERTIFICATE_PROPERTY_NAME)
-      .and_then(|certificate_uri| {
-        read_uri(&certificate_uri).map_err(|conf_err| {
-          create_security_error_and_log!(
-            "Failed to read the DomainParticipant identity certificate from {}: {:?}",
-            certificate_uri,
-            conf_err
-          )
-        })
-      })
-      .and_then(|certificate_contents_pem| {
-        Certificate::from_pem(certificate_contents_pem)
-          .map_err(|e| create_security_error_and_log!("{e:?}"))
-      })?;
+    let identity_certificate =
+      read_certificate(participant_qos, QOS_IDENTITY_CERTIFICATE_PROPERTY_NAME)?;
 
-    // TODO: decrypt a password protected private key
-    let _password = participant_qos.get_optional_property(QOS_PASSWORD_PROPERTY_NAME);
-
-    let id_cert_algorithm = identity_certificate.algorithm().ok_or_else(|| {
-      create_security_error_and_log!("Cannot recognize identity certificate algorithm.")
-    })?;
-
-    let id_cert_private_key = participant_qos
-      .get_property(QOS_PRIVATE_KEY_PROPERTY_NAME)
-      .and_then(|pem_uri| {
-        read_uri_to_private_key(&pem_uri, id_cert_algorithm).map_err(|conf_err| {
-          create_security_error_and_log!(
-            "Failed to read the DomainParticipant identity private key from {}: {:?}",
-            pem_uri,
-            conf_err
-          )
-        })
-      })?;
+    let id_cert_private_key = read_private_key(participant_qos, QOS_PRIVATE_KEY_PROPERTY_NAME)?;
 
     // Verify that CA has signed our identity
     identity_certificate
       .verify_signed_by_certificate(&identity_ca)
-      .map_err(|_e| {
-        create_security_error_and_log!(
-          "My own identity certificate does not verify against identity CA."
-        )
+      .map_err(|e| {
+        let uri = participant_qos
+          .get_property(QOS_IDENTITY_CERTIFICATE_PROPERTY_NAME)
+          .unwrap_or_default();
+        create_security_error_and_log!("{uri}: {}", e.msg)
       })?;
+
+    if id_cert_private_key.public_key() != identity_certificate.public_key() {
+      let uri = participant_qos.get_property(QOS_PRIVATE_KEY_PROPERTY_NAME)?;
+      return Err(create_security_error_and_log!(
+        "{uri}: is not the private key of the identity certificate"
+      ));
+    }
 
     // TODO: Check (somehow) that my identity has not been revoked.
 
@@ -196,24 +157,11 @@ impl Authentication for AuthenticationBuiltin {
     // Section "9.3.2.1 DDS:Auth:PKI-DH IdentityToken"
     // Table 45
     //
-    let certificate_algorithm = identity_certificate
-      .key_algorithm()
-      .ok_or_else(|| {
-        create_security_error_and_log!("Identity Certificate specifies no public key algorithm")
-      })
-      .and_then(CertificateAlgorithm::try_from)?;
-    let ca_algorithm = identity_ca
-      .key_algorithm()
-      .ok_or_else(|| {
-        create_security_error_and_log!("CA Certificate specifies no public key algorithm")
-      })
-      .and_then(CertificateAlgorithm::try_from)?;
-
     let identity_token = BuiltinIdentityToken {
       certificate_subject: Some(identity_certificate.subject_name().clone().serialize()),
-      certificate_algorithm: Some(certificate_algorithm),
+      certificate_algorithm: Some(CertificateAlgorithm::ECPrime256v1),
       ca_subject: Some(identity_ca.subject_name().clone().serialize()),
-      ca_algorithm: Some(ca_algorithm),
+      ca_algorithm: Some(CertificateAlgorithm::ECPrime256v1),
     };
 
     let local_identity_handle = self.get_new_identity_handle();
@@ -432,7 +380,7 @@ impl Authentication for AuthenticationBuiltin {
 
     let dsign_algo = local_info
       .identity_certificate
-      .signature_algorithm_identifier()?;
+      .signature_algorithm_identifier();
 
     let kagree_algo = Bytes::from(dh_keys.kagree_algo_name_str());
 
@@ -554,7 +502,7 @@ impl Authentication for AuthenticationBuiltin {
     // Check which key agreement algorithm the remote has chosen & generate our own
     // key pair
     let dh2_keys = if request.c_kagree_algo == *DH_MODP_KAGREE_ALGO_NAME {
-      DHKeys::new_modp_keys()?
+      DHKeys::new_modp_keys(&self.secure_random_generator)?
     } else if request.c_kagree_algo == *ECDH_KAGREE_ALGO_NAME {
       DHKeys::new_ec_keys(&self.secure_random_generator)?
     } else {
@@ -601,7 +549,7 @@ impl Authentication for AuthenticationBuiltin {
 
     let my_dsign_algo = local_info
       .identity_certificate
-      .signature_algorithm_identifier()?;
+      .signature_algorithm_identifier();
 
     let pdata_bytes = Bytes::from(serialized_local_participant_data);
 
@@ -987,7 +935,7 @@ impl Authentication for AuthenticationBuiltin {
 
         // Now we use the remote certificate, which we verified in the previous (request
         // -> reply) step against CA.
-        let remote_signature_algo_name = remote_id_certificate.signature_algorithm_identifier()?;
+        let remote_signature_algo_name = remote_id_certificate.signature_algorithm_identifier();
         let remote_signature_algorithm =
           parse_signature_algo_name_to_ring(&remote_signature_algo_name)?;
 

@@ -27,7 +27,8 @@ def recorded(start_for_module, domain: int, tmp_path_factory: pytest.TempPathFac
     parameters = ["--ros-args"]
     for file in ("sim_workcell.yaml", "hardware/realistic.yaml"):
         parameters += ["--params-file", REPOSITORY / "config" / file]
-    parameters += ["-p", f"perturbation:={REPOSITORY / 'config/perturbations/mild.yaml'}"]
+    # A bag of images at 30 Hz would be large.
+    parameters += ["-p", f"perturbation:={REPOSITORY / 'config/perturbations/mild.yaml'}", "-p", "frames_period_s:=0.5"]
     start_for_module("sim_workcell", *parameters)
     bag = tmp_path_factory.mktemp("check") / "bag"
     topics = [f"/{camera}/{topic}" for camera in ("front", "left", "right") for topic in TOPICS]
@@ -66,9 +67,12 @@ def sctn(domain: int, *arguments: object) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, env=environment(domain), capture_output=True, text=True, timeout=120.0, check=False)
 
 
-def check(domain: int, bag: pathlib.Path, *arguments: object) -> tuple[int, dict[tuple[str, str], bool]]:
+def check(
+    domain: int, bag: pathlib.Path, *arguments: object, parameters: tuple[str, ...] = ("frames:=5",)
+) -> tuple[int, dict[tuple[str, str], bool]]:
     """The exit code, and what each row says."""
-    ended = sctn(domain, "check", "--bag", bag, "--json", *arguments)
+    ros = [word for parameter in parameters for word in ("-p", f"camera_fusion:{parameter}")]
+    ended = sctn(domain, "check", "--bag", bag, "--json", *arguments, "--", *ros)
     rows = json.loads(ended.stdout.splitlines()[-1])["measures"]
     return ended.returncode, {(row["name"], row["subject"]): row["good"] for row in rows}
 
@@ -115,8 +119,7 @@ def test_it_measures_with_the_median_and_the_workspace_of_the_fusion(domain: int
     assert ended.returncode == 1
     assert "expected 62 or more" in ended.stderr
     # Twice as far as the arm reaches.
-    far = ["-p", "camera_fusion:workspace.origin_x_m:=1.2"]
-    code, rows = check(domain, recorded, "--", *far)
+    code, rows = check(domain, recorded, parameters=("workspace.origin_x_m:=1.2",))
     assert code == 1
     assert not any(good for (name, _), good in rows.items() if name == "reach")
     ended = sctn(domain, "check", "--bag", recorded, "--", "-p", "camera_fusion:camera_preset:=kinect")
@@ -138,7 +141,7 @@ def test_a_red_row_keeps_the_executor_of_a_real_cell_from_starting(start, tmp_pa
     parameters = ["--ros-args"]
     for file in ("sim_workcell.yaml", "hardware/realistic.yaml"):
         parameters += ["--params-file", REPOSITORY / "config" / file]
-    parameters += ["-p", "frames_period_s:=0.25"]
+    parameters += ["-p", "frames_period_s:=0.1"]
     if "controllers" in wrong:
         parameters += ["-p", "hardware.inactive_controllers:=[tool_contact_controller]"]
     own = free_domain()
@@ -173,7 +176,7 @@ def test_depth_that_the_fusion_registers_is_measured_as_it_registers_it(tmp_path
             cameras.wait_for_fusion()
             cameras.publish_extrinsics()
             cameras.publish_depth_frames()
-            for _ in range(12):
+            for _ in range(16):
                 cameras.publish(unregistered, None)
                 operator.spin(0.2)
         recorder.send_signal(signal.SIGINT)

@@ -1,4 +1,4 @@
-"""What the README shows works as it stands."""
+"""What README and guide show works as it stands."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from processes import REPOSITORY, environment
 STEPS = 9
 
 
-def test_the_operator_script_of_the_readme_carries_a_run_through(start, domain: int, tmp_path: pathlib.Path) -> None:
-    (script,) = re.findall(r"```python\n(.*?)```", (REPOSITORY / "README.md").read_text(), re.DOTALL)
+def test_the_operator_script_of_the_guide_carries_a_run_through(start, domain: int, tmp_path: pathlib.Path) -> None:
+    (script,) = re.findall(r"```python\n(.*?)```", (REPOSITORY / "docs/guide/operate.md").read_text(), re.DOTALL)
     log = tmp_path / "script.log"
     profile = {"FASTRTPS_DEFAULT_PROFILES_FILE": os.environ["FASTRTPS_DEFAULT_PROFILES_FILE"]}
     with log.open("wb") as output:

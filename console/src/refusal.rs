@@ -76,6 +76,9 @@ pub fn advice(reason: RefusalReason) -> &'static str {
         RefusalReason::NotAnOperator => {
             "Ask one of those who are named, or have your name added to the executor's parameter operators."
         }
+        RefusalReason::DriverSetup => {
+            "The driver is not set up as the executor needs it: docs/guide/real_cell.md."
+        }
         RefusalReason::DriverSilent => {
             "The robot's driver has fallen silent. Look at its process and its network."
         }

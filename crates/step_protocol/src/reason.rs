@@ -66,8 +66,10 @@ pub enum RefusalReason {
     AlreadyHolds = 27,
     /// The enabling input is low.
     Disabled = 28,
+    /// The driver is not set up as the executor needs it: controllers, software, tool voltage.
+    DriverSetup = 29,
     /// Whoever has decided is none of the operators.
-    NotAnOperator = 29,
+    NotAnOperator = 30,
 }
 
 impl RefusalReason {
@@ -115,9 +117,10 @@ impl RefusalReason {
             Self::NobodyPresent => &["no operator is present"],
             Self::RobotMode => &["robot mode"],
             Self::SafetyMode => &["safety mode"],
-            Self::RobotProgram => &["robot program", "whether its program runs"],
+            Self::RobotProgram => &["robot program"],
             Self::DriverSilent => &[
                 "the driver is silent",
+                "the driver has not",
                 "the newest joint_states",
                 "the newest io_states",
                 "no joint_states",
@@ -138,6 +141,16 @@ impl RefusalReason {
             Self::HoldsNothing => &["holds nothing"],
             Self::AlreadyHolds => &["already holds"],
             Self::Disabled => &["enabling input"],
+            Self::DriverSetup => &[
+                "the driver's set-up",
+                "controller `",
+                "controllers",
+                "nobody serves the action",
+                "the robot has software",
+                "robot software",
+                "tool_output_voltage",
+                "no tool_data",
+            ],
             Self::NotAnOperator => &["does not decide here"],
         }
     }

@@ -352,6 +352,22 @@ fn after_a_fault_the_step_can_be_tried_again() {
 }
 
 #[test]
+fn images_of_a_driver_with_other_names_are_watched_too() {
+    let mut run = proposed();
+    let image = "in messages=9 rate_hz=1.0 age_s=3.5 dropped=0 errors=0";
+    let late = NodeReport {
+        values: vec![("/front/depth/depth_registered".into(), image.into())],
+        ..report("/camera_fusion", "topics", "all messages arrive whole")
+    };
+    run.on_report(late, NOW);
+    let refusal = run.check(Decision::Approve, NOW).unwrap_err();
+    assert!(
+        refusal.reason.contains("front/depth/depth_registered"),
+        "{refusal:?}"
+    );
+}
+
+#[test]
 fn what_is_stale_cannot_be_approved_but_can_be_stopped() {
     let late = NOW + Duration::from_secs(4);
     let run = proposed();

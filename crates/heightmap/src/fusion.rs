@@ -89,7 +89,7 @@ impl LensRays {
 }
 
 /// The cell of points off the grid.
-const OUTSIDE: u32 = u32::MAX;
+pub(crate) const OUTSIDE: u32 = u32::MAX;
 
 impl Fusion {
     /// Highest point per cell wins; colour is the mean over the views that saw the cell
@@ -328,19 +328,19 @@ const NO_FRACTION: f32 = (1 << 23) as f32;
 
 /// Rounds down; for numbers from 0 to 2^22. Unlike `f32::floor` and `as` it needs nothing that
 /// the oldest x86-64 lacks, so that the compiler can do several at once.
-fn floor(x: f32) -> f32 {
+pub(crate) fn floor(x: f32) -> f32 {
     let nearest = (x + NO_FRACTION) - NO_FRACTION;
     nearest - if nearest > x { 1.0 } else { 0.0 }
 }
 
 /// A whole number from 0 to 2^22 as an integer.
-fn whole(x: f32) -> u32 {
+pub(crate) fn whole(x: f32) -> u32 {
     (x + NO_FRACTION).to_bits() & 0x7f_ffff
 }
 
 /// Sums divided by a number of views, rounded. Multiplies by the reciprocal, which is exact for the
 /// sums of up to [`MAX_VIEWS`] bytes.
-fn mean(sums: [u32; 3], views: u32) -> [u8; 3] {
+pub(crate) fn mean(sums: [u32; 3], views: u32) -> [u8; 3] {
     const RECIPROCALS: [u64; MAX_VIEWS + 1] = {
         let mut reciprocals = [0; MAX_VIEWS + 1];
         let mut views = 1;

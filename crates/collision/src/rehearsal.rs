@@ -39,6 +39,8 @@ struct Rehearsal<'a> {
     carried: Option<Carried>,
     /// Where the tool is in contact.
     contact: Option<Contact>,
+    /// A descent that meets nothing leads no further below what was seen (m).
+    sinks_m: f64,
     clearance: Rc<Cell<Clearance>>,
     /// Ways that the empty tool may take over what was seen.
     free: Rc<RefCell<Vec<StraightWay>>>,
@@ -140,7 +142,7 @@ struct Branch<'a> {
 /// Plans every motion of an action from where the arm is and checks it against cell and heightmap: as it is expected to go, and every way in which it
 /// ends without an object at the place, the arm going home by itself.
 ///
-/// - [`Outcome::NoContact`]: from the lowest that the descent to the pick may lead to.
+/// - [`Outcome::NoContact`]: from the lowest that the descent to the pick may lead to: 15 mm below what was seen, and further by the window of a touchdown.
 /// - [`Outcome::GraspFailed`]: from where the object would be lifted to; it stands where it stood.
 /// - [`Outcome::Dropped`]: the primitive notices it at the end of the transfer and at the end of the descent to the place. Until then the empty arm goes
 ///   where the loaded arm was expected to go, and that is free for it: arm and tool are the same, and the loaded arm has the object besides. Only the
@@ -175,6 +177,7 @@ pub fn rehearse(
     let primitive = primitive.map_err(|error| failed(Outcome::Placed, error.into()))?;
     let mut robot = Rehearsal::new(checker, arm, joints, heightmap);
     robot.holds = holds;
+    robot.sinks_m += touchdown.map_or(0.0, |touchdown| touchdown.window_m);
     if (joints - arm.home).amax() > AT_HOME_RAD {
         // The arm may have been stopped on the table.
         robot.contact = Some(robot.contact_here());
@@ -291,6 +294,7 @@ impl<'a> Rehearsal<'a> {
             table,
             carried: None,
             contact: None,
+            sinks_m: ROUGH_M,
             clearance: Rc::new(Cell::new(Clearance {
                 least_m: f64::INFINITY,
                 samples: 0,
@@ -411,17 +415,31 @@ impl Rehearsal<'_> {
         let Command::FollowUntilContact(descent) = command else {
             return Ok(Report::Holds(false));
         };
-        // To its end: as far down as contact may come, or none.
+        // As far down as contact may come, or none: what was seen may be lower.
+        let surface_m = self.surface_m(self.below(descent));
+        let (descent, _) = self.until(descent, surface_m - self.sinks_m);
         let contact = Contact {
-            up_to_m: self.surface_m(self.below(descent)) + ROUGH_M,
+            up_to_m: surface_m + ROUGH_M,
             ..self.contact_at(&descent.last().positions_rad)
         };
-        self.check(descent, vec![contact])?;
+        self.check(&descent, vec![contact])?;
         self.contact = Some(contact);
         Ok(match ends {
             Outcome::NoContact => Report::NoContact(self.joints),
             _ => Report::Contact(self.joints),
         })
+    }
+
+    /// The part of a descent up to the first point that is no higher than a height of the tip, and whether there is one.
+    fn until(&self, descent: &JointTrajectory, stop_m: f64) -> (JointTrajectory, bool) {
+        let points = descent.points();
+        let is_above = |point: &&ur5::TrajectoryPoint| {
+            self.arm.tip(&point.positions_rad).translation.z > stop_m
+        };
+        let above = points.iter().take_while(is_above).count();
+        let until = points[..(above + 1).min(points.len())].to_vec();
+        let until = JointTrajectory::new(until).unwrap_or_else(|_| descent.clone());
+        (until, above < points.len())
     }
 
     /// Where a trajectory ends, in the world's xy-plane.
@@ -463,18 +481,7 @@ impl Robot for Rehearsal<'_> {
             carried.tip_from_shape.translation.z + carried.shape.extent_m(&Vector3::z())
         });
         let stop_m = self.surface_m(self.below(trajectory)) + hangs_m;
-        let points = trajectory.points();
-        let is_above = |point: &&ur5::TrajectoryPoint| {
-            self.arm.tip(&point.positions_rad).translation.z > stop_m
-        };
-        let above = points.iter().take_while(is_above).count();
-        let meets = above < points.len();
-        // Up to the first point that is not above the surface.
-        let until = points[..(above + 1).min(points.len())].to_vec();
-        let descent = match JointTrajectory::new(until) {
-            Ok(descent) => descent,
-            Err(_) => trajectory.clone(),
-        };
+        let (descent, meets) = self.until(trajectory, stop_m);
         let contact = self.contact_at(&descent.last().positions_rad);
         self.check(&descent, vec![contact])?;
         self.contact = Some(contact);
@@ -504,5 +511,32 @@ impl Robot for Rehearsal<'_> {
 
     fn holds(&mut self) -> Result<bool, Box<Collision>> {
         Ok(self.holds)
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use nalgebra::Isometry2;
+    use ur5::WorkCell;
+
+    #[test]
+    fn a_way_back_is_the_same_way_unless_it_is_faster_or_bends() {
+        let arm = WorkCell::builtin().unwrap().arm;
+        let at = |y_m| Arm::tip_down(&Isometry2::translation(0.5, y_m), 0.24);
+        let over = arm.solve(&at(-0.2), &arm.ready).unwrap();
+        let way = |from: &Joints, to: &Joints, tip_m_s| {
+            let way = JointTrajectory::joint_space_within(&arm, from, to, tip_m_s);
+            StraightWay::of(&way.unwrap()).unwrap()
+        };
+        let known = way(&arm.home, &over, 0.8);
+        assert!(known.is_same(&way(&arm.home, &over, 0.8)));
+        assert!(known.is_same(&way(&over, &arm.home, 0.8)));
+        assert!(!known.is_same(&way(&over, &arm.home, 0.2)));
+        let elsewhere = arm.solve(&at(-0.19), &arm.ready).unwrap();
+        assert!(!known.is_same(&way(&elsewhere, &arm.home, 0.8)));
+        // Straight for the tip.
+        let line = JointTrajectory::line(&arm, &over, &at(0.2), 0.5, 2.0).unwrap();
+        assert!(StraightWay::of(&line).is_none());
     }
 }

@@ -636,87 +636,61 @@ fn cell_with_ball(at: Vector3<f64>) -> WorkCell {
 fn what_only_a_way_home_after_a_failure_would_hit_is_refused_and_named() {
     let arm = &cell().arm;
     let pose = |y_m| Isometry2::new(Vector2::new(0.5, y_m), 0.0);
-    let action = PickPlace {
-        pick: pose(-0.25),
-        place: pose(0.25),
-    };
-    // Lifted higher than the clearance, so that each failure is noticed where nothing else leads home from.
-    let settings = PrimitiveSettings {
-        clearance_m: 0.15,
-        lift_m: 0.3,
-        ..PrimitiveSettings::RIGID
-    };
-    let over = |pose: &Isometry2<f64>, height_m| {
-        let above = Arm::tip_down(pose, height_m);
+    let over = |y_m, height_m| {
+        let above = Arm::tip_down(&pose(y_m), height_m);
         arm.solve(&above, &arm.ready).unwrap()
     };
-    let (pick, place) = action.tips();
-    for (ends, start, from, reason) in [
+    // Lifted much higher than the clearance: a failure is noticed where nothing else leads home from.
+    let (low_m, high_m) = (0.05, 0.45);
+    let settings = PrimitiveSettings {
+        clearance_m: low_m,
+        lift_m: high_m,
+        ..PrimitiveSettings::RIGID
+    };
+    let (right_m, left_m) = (-0.25, 0.25);
+    let home_from = |from: Joints, share: f64| from + (arm.home - from) * share;
+    let tip = |joints| arm.tip(&joints).translation.vector;
+    let wrist = |joints| arm.links(&joints)[3].translation.vector;
+    // How it ends, where it begins, picks and places, and where a ball hangs on the way home from there.
+    let cases = [
         (
             Outcome::NoContact,
-            over(&place, 0.3),
-            over(&pick, 0.15),
+            (over(left_m, high_m), right_m, left_m),
+            tip(home_from(over(right_m, low_m), 0.4)),
             "if there is nothing to pick: Home",
         ),
         (
             Outcome::GraspFailed,
-            arm.home,
-            over(&pick, 0.3),
+            (arm.home, left_m, right_m),
+            wrist(home_from(over(left_m, high_m), 0.3)),
             "if suction holds nothing: Home",
         ),
         (
             Outcome::Dropped,
-            arm.home,
-            over(&place, 0.3),
+            (arm.home, right_m, left_m),
+            wrist(home_from(over(left_m, high_m), 0.4)),
             "if the object is lost on its way: Home",
         ),
-    ] {
-        let way = JointTrajectory::joint_space(arm, &from, &arm.home).unwrap();
-        let refused = (1..10).filter_map(|tenth| {
-            let joints = way.sample(way.duration() * tenth / 10);
-            let with_ball = cell_with_ball(arm.tip(&joints).translation.vector);
+    ];
+    for (ends, (start, pick_m, place_m), ball_at, reason) in cases {
+        let action = PickPlace {
+            pick: pose(pick_m),
+            place: pose(place_m),
+        };
+        let rehearsed = |cell: &WorkCell| {
             let situation = Situation {
                 joints: &start,
                 holds: false,
                 heightmap: Some(&empty_table()),
                 touchdown: None,
             };
-            let checker = checker(&with_ball);
-            rehearse(&checker, arm, &action, &settings, &situation).err()
-        });
-        let refused: Vec<_> = refused.collect();
-        // Some of the balls are in the way of what is expected, too; that is looked at first.
-        let found = refused.iter().find(|refused| refused.ends == ends);
-        let found = found.unwrap_or_else(|| panic!("{ends:?}: {refused:#?}"));
-        let text = found.to_string();
+            rehearse(&checker(cell), arm, &action, &settings, &situation)
+        };
+        rehearsed(&cell()).unwrap();
+        let refused = rehearsed(&cell_with_ball(ball_at)).unwrap_err();
+        let text = refused.to_string();
+        // What is expected is looked at first: it is free.
+        assert_eq!(refused.ends, ends, "{text}");
         assert!(text.starts_with(reason) && text.contains("ball"), "{text}");
     }
-}
-
-#[test]
-fn the_ways_home_after_a_failure_cost_little() {
-    let cell = cell();
-    let checker = checker(&cell);
-    let (heightmap, action) = block_beside_a_wall(0.1, 0.0);
-    let (arm, settings) = (&cell.arm, PrimitiveSettings::BEADS);
-    let situation = Situation {
-        joints: &arm.home,
-        holds: false,
-        heightmap: Some(&heightmap),
-        touchdown: None,
-    };
-    let (outcome, clearance) = rehearse(&checker, arm, &action, &settings, &situation).unwrap();
-    assert_eq!(outcome, Outcome::Placed);
-    // What is expected alone.
-    let motions = motions(arm, &action, &settings).unwrap();
-    let samples = |motion: &JointTrajectory| {
-        let found = checker.check(motion, &Scene::default());
-        found.map_or(0, |found| found.samples)
-    };
-    let expected: usize = motions.iter().map(|(motion, _)| samples(motion)).sum();
-    println!(
-        "{} samples, {expected} for what is expected",
-        clearance.samples
-    );
-    assert!(clearance.samples < 2 * expected, "{expected} {clearance:?}");
 }

@@ -662,7 +662,7 @@ mod tests {
         let seen = Arc::new(Heightmap::new(heightmap::Workspace::RAVENS));
         let robot = RobotNow {
             seen: Some((seen, Duration::ZERO)),
-            ..robot_at(0.25, 0.3)
+            ..robot_at(0.25, 0.45)
         };
         let pose = |y_m| Isometry2::new(Vector2::new(0.5, y_m), 0.0);
         let proposal = Proposal {
@@ -670,19 +670,25 @@ mod tests {
                 pick: pose(-0.25),
                 place: pose(0.25),
             },
+            settings: PrimitiveSettings {
+                clearance_m: 0.05,
+                lift_m: 0.45,
+                ..PrimitiveSettings::RIGID
+            },
             ..proposal(0.5)
         };
         planned(&robot, &proposal).unwrap();
         let arm = &robot.arm;
-        let over_pick = Arm::tip_down(&proposal.action.pick, 0.24);
+        let over_pick = Arm::tip_down(&proposal.action.pick, 0.05);
         let over_pick = arm.solve(&over_pick, &arm.ready).unwrap();
-        // A ball hangs half-way home from the pick.
-        let half_way = arm.tip(&(0.5 * (over_pick + arm.home))).translation;
+        // A ball hangs on the way home from the pick.
+        let on_the_way = over_pick + 0.4 * (arm.home - over_pick);
+        let ball_at = arm.tip(&on_the_way).translation;
         let ball = format!(
             "<link name=\"ball\"><collision><geometry><sphere radius=\"0.02\"/></geometry></collision></link>\
             <joint name=\"world-ball\" type=\"fixed\"><parent link=\"world\"/><child link=\"ball\"/>\
             <origin xyz=\"{} {} {}\" rpy=\"0 0 0\"/></joint></robot>",
-            half_way.x, half_way.y, half_way.z
+            ball_at.x, ball_at.y, ball_at.z
         );
         let urdf = WorkCell::builtin().unwrap().urdf;
         let cell = WorkCell::parse(&urdf.replace("</robot>", &ball), "cell.urdf").unwrap();
@@ -693,7 +699,7 @@ mod tests {
         };
         let reason = planned(&robot, &proposal).unwrap_err();
         assert!(
-            reason.starts_with("if ") && reason.contains("Home") && reason.contains("ball"),
+            reason.starts_with("if there is nothing to pick: Home") && reason.contains("ball"),
             "{reason}"
         );
     }

@@ -675,9 +675,9 @@ async fn a_whole_pick_and_place_needs_no_tool_contact_where_vacuum_or_height_is_
 
 #[tokio::test(flavor = "multi_thread")]
 async fn vacuum_that_builds_up_after_the_end_of_the_way_down_is_waited_for() {
-    let hardware = [("braking_time_s", "0.1"), ("vacuum_build_s", "0.9")];
+    let hardware = [("braking_time_s", "0.1"), ("vacuum_build_s", "1.5")];
     let driver = DriverParameters {
-        grasp_wait_s: 2.0,
+        grasp_wait_s: 3.0,
         ..sensing(ContactSign::Vacuum)
     };
     let bench = Bench::start(&hardware, driver).await;
@@ -755,7 +755,7 @@ async fn an_object_that_is_lost_in_mid_air_ends_as_dropped_at_home() {
     let hardware = [
         ("braking_time_s", "0.1"),
         ("vacuum_build_s", "0.1"),
-        // Long after the lift, and long before the end of a transfer of 0.18 m at 0.1 m/s.
+        // Long after the lift, and long before the end of a transfer of 0.4 m at 0.1 m/s.
         ("vacuum_leak_s", "2.3"),
     ];
     let bench = Bench::start(&hardware, sensing(ContactSign::Height)).await;

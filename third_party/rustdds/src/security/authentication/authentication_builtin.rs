@@ -12,6 +12,7 @@ use crate::{
     access_control::PermissionsToken, certificate, private_key, security_error, SecurityError,
     SecurityResult,
   },
+  structure::guid::GuidPrefix,
   GUID,
 };
 use self::{
@@ -104,7 +105,7 @@ struct LocalParticipantInfo {
 // All things about remote participant that we're interested in
 struct RemoteParticipantInfo {
   //identity_token: IdentityToken,
-  //guid_prefix: GuidPrefix,
+  guid_prefix: GuidPrefix,
   identity_certificate_opt: Option<certificate::Certificate>, /* Not available at first.
                                                                * Obtained from handshake
                                                                * request/reply message */

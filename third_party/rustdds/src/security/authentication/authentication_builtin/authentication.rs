@@ -60,8 +60,15 @@ fn guid_start_from_certificate(identity_cert: &Certificate) -> SecurityResult<[u
 
 fn validate_remote_guid(
   remote_guid: GUID,
+  sender: GuidPrefix,
   remote_identity_cert: &Certificate,
 ) -> SecurityResult<()> {
+  if remote_guid.prefix != sender {
+    return Err(create_security_error_and_log!(
+      "Participant {sender:?} shows the data of {:?}",
+      remote_guid.prefix
+    ));
+  }
   let actual_guid_start = &remote_guid.prefix.as_ref()[0..6];
   let expected_guid_start = guid_start_from_certificate(remote_identity_cert).map_err(|e| {
     create_security_error_and_log!("Could not determine the expected GUID start: {e}")
@@ -189,6 +196,7 @@ impl Authentication for AuthenticationBuiltin {
     let random_bytes3 = self.generate_random_32_bytes()?;
 
     let self_remote_info = RemoteParticipantInfo {
+      guid_prefix: adjusted_guid.prefix,
       identity_certificate_opt: None,
       signed_permissions_xml_opt: None,
       handshake: HandshakeInfo {
@@ -324,7 +332,7 @@ impl Authentication for AuthenticationBuiltin {
     let remote_identity_handle = self.get_new_identity_handle();
 
     let remote_info = RemoteParticipantInfo {
-      //guid_prefix: remote_participant_guidp,
+      guid_prefix: remote_participant_guidp,
       //identity_token: remote_identity_token,
       identity_certificate_opt: None,   // Not yet available
       signed_permissions_xml_opt: None, // Not yet available
@@ -464,6 +472,7 @@ impl Authentication for AuthenticationBuiltin {
 
     // Make sure we are expecting a authentication request from remote
     let remote_info = self.get_remote_participant_info(&initiator_identity_handle)?;
+    let sender = remote_info.guid_prefix;
     if let BuiltinHandshakeState::PendingRequestMessage = remote_info.handshake.state {
       // Nothing to see here. Carry on.
     } else {
@@ -495,7 +504,7 @@ impl Authentication for AuthenticationBuiltin {
         )
       })?;
 
-    validate_remote_guid(remote_pdata.participant_guid, &cert1).map_err(|e| {
+    validate_remote_guid(remote_pdata.participant_guid, sender, &cert1).map_err(|e| {
       create_security_error_and_log!("Remote GUID does not comply with the spec: {e}")
     })?;
 
@@ -649,6 +658,7 @@ impl Authentication for AuthenticationBuiltin {
     // key pairs, which cannot be cloned. We just move the "state" out and leave
     // a dummy value behind. At the end of this function we will overwrite the
     // dummy.
+    let sender = remote_info.guid_prefix;
     let mut state = BuiltinHandshakeState::PendingRequestSend; // dummy to leave behind
     std::mem::swap(&mut remote_info.handshake.state, &mut state);
 
@@ -688,7 +698,7 @@ impl Authentication for AuthenticationBuiltin {
             )
           })?;
 
-        validate_remote_guid(remote_pdata.participant_guid, &cert2).map_err(|e| {
+        validate_remote_guid(remote_pdata.participant_guid, sender, &cert2).map_err(|e| {
           create_security_error_and_log!("Remote GUID does not comply with the spec: {e}")
         })?;
 
@@ -1070,7 +1080,7 @@ iHhbVPRB9Uxts9CwglxYgZoUdGUAxreYIIaLO4yLqw==
     let invalid_guid = GUID::dummy_test_guid(EntityKind::PARTICIPANT_BUILT_IN);
     let some_certificate = Certificate::from_pem(cert_pem).unwrap();
 
-    let validation_res = validate_remote_guid(invalid_guid, &some_certificate);
+    let validation_res = validate_remote_guid(invalid_guid, invalid_guid.prefix, &some_certificate);
 
     assert!(
       validation_res.is_err(),

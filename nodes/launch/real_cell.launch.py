@@ -65,6 +65,7 @@ def generate_launch_description() -> LaunchDescription:
             *("-p", ['camera_fusion:calibration:="', LaunchConfiguration("calibration"), '"']),
             *("-p", ["suction_executor:driver.contact:=", LaunchConfiguration("contact")]),
             *("-p", ['suction_executor:arm_calibration:="', LaunchConfiguration("arm_calibration"), '"']),
+            *("--params-file", share("config", "real_cell.yaml")),
             *("--params-file", LaunchConfiguration("parameters")),
         ],
         condition=IfCondition(LaunchConfiguration("check")),
@@ -110,7 +111,8 @@ def generate_launch_description() -> LaunchDescription:
             DeclareLaunchArgument(
                 "parameters",
                 default_value=share("config", "real_cell.yaml"),
-                description="File of what is different on this cell, laid out as config/real_cell.yaml; it wins over all others.",
+                description="File of what is different on this cell, laid out as config/real_cell.yaml; it wins over the others. What has an "
+                "argument here (frames, camera_preset, calibration, contact, arm_calibration) is given by that, as `sctn check` takes it.",
             ),
             DeclareLaunchArgument(
                 "stop_file",

@@ -353,7 +353,7 @@ fn policy(nodes: &[(&str, BTreeSet<Endpoint>)]) -> String {
     let mut text = String::from(
         "<?xml version=\"1.0\" encoding=\"UTF-8\"?>\n\
          <!-- What each node may do where ROS_SECURITY_ENABLE is true, for `ros2 security generate_artifacts` (docs/guide/security.md). Made by\n     \
-         `sctn interfaces --policy > config/sros2_policy.xml` from the running nodes; a test holds it current. Names follow the namespace `ns`: change\n     \
+         `sctn interfaces` with its option `policy` from the running nodes; a test holds it current. Names follow the namespace `ns`: change\n     \
          that where the cell has one, and topics where you remap them or the cameras and the driver have other names. -->\n\
          <policy version=\"0.2.0\">\n  <enclaves>\n",
     );

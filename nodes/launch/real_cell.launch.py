@@ -111,8 +111,8 @@ def generate_launch_description() -> LaunchDescription:
             DeclareLaunchArgument(
                 "parameters",
                 default_value=share("config", "real_cell.yaml"),
-                description="File of what is different on this cell, laid out as config/real_cell.yaml; it wins over the others. What has an "
-                "argument here (frames, camera_preset, calibration, contact, arm_calibration) is given by that, as `sctn check` takes it.",
+                description="File of what is different on this cell, laid out as config/real_cell.yaml; it wins over the others. What has "
+                "an argument here (frames, camera_preset, calibration, contact, arm_calibration) is given by that: `sctn check` needs it.",
             ),
             DeclareLaunchArgument(
                 "stop_file",

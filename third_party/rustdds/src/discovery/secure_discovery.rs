@@ -107,7 +107,9 @@ pub(crate) struct SecureDiscovery {
 
   // In the key, first GUID is local endpoint's, second is remote endpoint's
   cached_received_key_exchange_messages: HashMap<(GUID, GUID), ParticipantVolatileMessageSecure>,
-  user_data_endpoints_with_keys_already_sent_to: HashSet<GUID>,
+  // Local endpoint's GUID, then that of the remote: several local endpoints may
+  // match one remote, and each has keys of its own.
+  user_data_endpoints_with_keys_already_sent_to: HashSet<(GUID, GUID)>,
 
   // A set for keeping track which remote readers are relay-only
   relay_only_remote_readers: HashSet<GUID>,
@@ -2394,21 +2396,23 @@ impl SecureDiscovery {
     // See if we have already sent our keys. Do nothing if so.
     let we_have_sent_ours = self
       .user_data_endpoints_with_keys_already_sent_to
-      .contains(&remote_endpoint_guid);
+      .contains(&(local_endpoint_guid, remote_endpoint_guid));
     if we_have_sent_ours {
       return;
     }
 
-    // Dig out remote's security attributes
+    // Dig out remote's security attributes. It may be an endpoint of our own.
+    let db = discovery_db_read(discovery_db);
     let sec_info_opt = if remote_is_writer {
-      discovery_db_read(discovery_db)
-        .get_topic_writer(&remote_endpoint_guid)
+      db.get_topic_writer(&remote_endpoint_guid)
+        .or_else(|| db.get_local_topic_writer(remote_endpoint_guid))
         .map(|writer| writer.publication_topic_data.security_info().clone())
     } else {
-      discovery_db_read(discovery_db)
-        .get_topic_reader(&remote_endpoint_guid)
+      db.get_topic_reader(&remote_endpoint_guid)
+        .or_else(|| db.get_local_topic_reader(remote_endpoint_guid))
         .map(|reader| reader.subscription_topic_data.security_info().clone())
     };
+    drop(db);
 
     let sec_attr = match sec_info_opt.flatten() {
       Some(info) => EndpointSecurityAttributes::from(info),
@@ -2443,7 +2447,7 @@ impl SecureDiscovery {
       // Mark as if we have sent keys to the remote
       self
         .user_data_endpoints_with_keys_already_sent_to
-        .insert(remote_endpoint_guid);
+        .insert((local_endpoint_guid, remote_endpoint_guid));
       return;
     }
 
@@ -2542,7 +2546,7 @@ impl SecureDiscovery {
     // Remember that we have successfully sent the keys
     self
       .user_data_endpoints_with_keys_already_sent_to
-      .insert(remote_endpoint_guid);
+      .insert((local_endpoint_guid, remote_endpoint_guid));
   }
 
   fn validate_remote_participant_permissions(

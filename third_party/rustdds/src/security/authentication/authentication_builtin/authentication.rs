@@ -754,6 +754,9 @@ impl Authentication for AuthenticationBuiltin {
         // Note: We already verified above that hash_c1-recomputed vs. hash_c1-stored
         // match and hash_c2 recomputed vs received (if any) match.
 
+        // A reply may repeat DH1 (Table 50), but ours is what counts.
+        let dh1_public_key = dh1.public_key_bytes()?;
+
         let cc2_properties: Vec<BinaryProperty> = vec![
           BinaryProperty::with_propagate(
             "hash_c2",
@@ -768,7 +771,7 @@ impl Authentication for AuthenticationBuiltin {
             "challenge1",
             Bytes::copy_from_slice(reply.challenge1.as_ref()),
           ),
-          BinaryProperty::with_propagate("dh1", Bytes::copy_from_slice(reply.dh1.as_ref())),
+          BinaryProperty::with_propagate("dh1", dh1_public_key.clone()),
           BinaryProperty::with_propagate("hash_c1", Bytes::copy_from_slice(hash_c1.as_ref())),
         ];
 
@@ -792,8 +795,6 @@ impl Authentication for AuthenticationBuiltin {
              HandshakeReplyMessageToken. Expected {expected_kagree_algo}"
           ));
         }
-
-        let dh1_public_key = dh1.public_key_bytes()?;
 
         // Compute the shared secret
         let shared_secret = dh1.compute_shared_secret(reply.dh2.clone())?;
@@ -899,7 +900,7 @@ impl Authentication for AuthenticationBuiltin {
         }
 
         // sanity check
-        if dh1_public != final_token.dh1 {
+        if final_token.dh1.is_some_and(|dh1| dh1 != dh1_public) {
           return Err(create_security_error_and_log!(
             "Diffie-Hellman parameter DH1 mismatch on authentication final receive"
           ));
@@ -907,7 +908,7 @@ impl Authentication for AuthenticationBuiltin {
 
         // sanity check
         let dh2_public_key = dh2.public_key_bytes()?;
-        if dh2_public_key.as_ref() != final_token.dh2.as_ref() {
+        if final_token.dh2.is_some_and(|dh2| dh2 != dh2_public_key) {
           return Err(create_security_error_and_log!(
             "Diffie-Hellman parameter DH2 mismatch on authentication final receive"
           ));

@@ -51,8 +51,6 @@ from fault_monitor import Kind, Violation
 WATCH_S = 2.5
 # A motion of these proposals takes some 10 s.
 LATEST_S = 9.0
-# The last messages arrive within this time.
-LAST_MESSAGES_S = 0.2
 # How much of the executor's log is shown after a violation.
 LOG_CHARACTERS = 3000
 # Faults that follow each other in one cell.
@@ -151,9 +149,7 @@ def run_cells(faults: list[Planned], seed: int, until_s: float = float("inf")) -
                         line.went_on = went_on = inject(bench, planned.fault, planned.moment_s)
                     except (TimeoutError, AssertionError) as error:
                         line.hung = went_on = str(error) or type(error).__name__
-                    # What is on its way comes.
-                    bench.operator.spin(LAST_MESSAGES_S)
-                    bench.settle()
+                    bench.catch_up()
                     found = bench.monitor.violations[known:]
                     line.violations = [(violation.kind.value, violation.text) for violation in found][:5]
                     if found:
@@ -300,7 +296,7 @@ def planted_campaign(only: str | None = None) -> dict[str, Violation | None]:
                 inject(bench, fault, moment_s)
             except (TimeoutError, AssertionError) as error:
                 print(f"{planted}: the run hangs: {error}", file=sys.stderr, flush=True)
-            bench.settle()
+            bench.catch_up()
             found = bench.monitor.violations
             first = next((violation for violation in found if violation.kind == expected), None)
             caught[planted] = first

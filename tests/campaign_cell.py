@@ -57,8 +57,19 @@ COUNTED_S = 15.0
 CONTROLLER = "scaled_joint_trajectory_controller"
 FOLLOW_ACTION = f"{CONTROLLER}/follow_joint_trajectory"
 UNTIL_ACTION = "trajectory_until_node/execute"
-# So much later the monitor hears of what was sent and done: by then all messages from before have come.
+# So much later the monitor hears of what was sent and done, and no sooner than readings of that time have come: by then all messages from
+# before have.
 REORDER_S = 0.5
+# A driver that is not heard for so long has nothing to say. On a machine that is too busy its readings come seconds late.
+SILENT_S = 5.0
+# Messages that come seldom arrive within this time of the readings.
+LAST_MESSAGES_S = 0.2
+# A step is tried again so often where somebody was not heard in time, the driver by the executor or the executor by the watchdog, and
+# what is said then.
+ATTEMPTS = 3
+UNHEARD = ("s old, expected at most", "were interrupted for more than", "ended as Canceled")
+# After a cancel the watchdog cancels everything for so long: insist_s of config/motion_watchdog.yaml.
+INSIST_S = 3.0
 COUNTER = itertools.count()
 # Every reading counts, also where this process is late.
 ALL = QoSProfile(depth=500, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.RELIABLE)
@@ -115,6 +126,8 @@ class Bench:
     fault: str = "none"
     # Disks that were picked.
     disks_used: int = 0
+    # Where the joints are at home, once the arm was brought there [rad].
+    home_rad: list[float] | None = None
     # What was changed of the simulated hardware, and what it was.
     changed: dict[str, Hardware] = dataclasses.field(default_factory=dict)
     # The proposal whose planned motion was said last.
@@ -123,6 +136,9 @@ class Bench:
     clock_ahead_s: float = 0.0
     # What was sent and done, by when [s], and what the monitor makes of it: it hears of it in that order, a little later.
     events: list[tuple[float, int, Callable[[], None]]] = dataclasses.field(default_factory=list)
+    # When the newest readings that have come were sent [s].
+    joints_read_s: float = float("-inf")
+    pins_read_s: float = float("-inf")
     # When something was done that exposes a fault of the executor: a proposal, an injected fault [s].
     exposed_s: list[float] = dataclasses.field(default_factory=list)
 
@@ -150,7 +166,17 @@ class Bench:
     def happened(self, at_s: float, event: Callable[[], None]) -> None:
         """Something was sent or done. A busy machine delivers messages late, and those of one topic before those of another."""
         heapq.heappush(self.events, (at_s, next(COUNTER), event))
-        self.settle(time.monotonic() - REORDER_S)
+        now = time.monotonic()
+        read_s = max(min(self.joints_read_s, self.pins_read_s), now - SILENT_S)
+        self.settle(min(read_s, now - REORDER_S))
+
+    def catch_up(self) -> None:
+        """The monitor hears of everything that was sent or done until now, which may be on its way."""
+        now = time.monotonic()
+        with contextlib.suppress(TimeoutError):
+            self.operator.until(lambda: min(self.joints_read_s, self.pins_read_s) >= now, "readings of the driver", SILENT_S)
+        self.operator.spin(LAST_MESSAGES_S)
+        self.settle()
 
     def settle(self, until_s: float = float("inf")) -> None:
         """The monitor hears of everything that was sent or done before a time."""
@@ -275,6 +301,7 @@ def watch(bench: Bench) -> None:
         suction = any(output.pin == SUCTION_PIN and output.state for output in pins.digital_out_states)
         bench.suction = suction
         bench.vacuum = any(sensor.pin == VACUUM_PIN and sensor.state for sensor in pins.digital_in_states)
+        bench.pins_read_s = sent_at(info)
         bench.happened(sent_at(info), lambda: monitor.on_suction(suction, sent_at(info)))
 
     def on_goals(action: str, goals: GoalStatusArray, info: dict[str, int]) -> None:
@@ -283,6 +310,7 @@ def watch(bench: Bench) -> None:
         bench.happened(sent_at(info), lambda: monitor.on_goals(action, statuses, sent_at(info), answers_late=late))
 
     def on_joints(read: JointState, info: dict[str, int]) -> None:
+        bench.joints_read_s = sent_at(info)
         bench.happened(sent_at(info), lambda: monitor.on_joints(read.position, sent_at(info)))
 
     def goals_of(action: str) -> Callable[[GoalStatusArray, dict[str, int]], None]:
@@ -394,8 +422,8 @@ def begin_from_home(bench: Bench) -> str:
     if went_on == "moves":
         return went_on
     # From where a fault has left it the arm may not get to the pick, or may be in view.
-    if not go_home(bench):
-        return f"stays, and does not get home: {went_on}"
+    if reason := go_home(bench):
+        return f"stays, and does not get home: {reason} (before: {went_on})"
     again = begin(bench)
     return f"moves from home ({went_on})" if again == "moves" else f"stays: {again}"
 
@@ -426,26 +454,62 @@ def recover(bench: Bench) -> None:
     operator.spin(0.5)
 
 
-def propose_home(bench: Bench) -> ProposeHome.Response:
-    """Has the way home proposed."""
-    client = bench.operator.node.create_client(ProposeHome, "suction_executor/propose_home")
-    bench.operator.until(client.service_is_ready, "service propose_home", 30.0)
-    answer = client.call_async(ProposeHome.Request())
-    bench.operator.until(answer.done, "answer of propose_home", 30.0)
-    return answer.result()
+def propose_home(bench: Bench, service: str = "propose_home") -> ProposeHome.Response:
+    """Has the way home proposed, or that what is held is put down first: propose_put_down."""
+    return bench.call(ProposeHome, f"suction_executor/{service}", ProposeHome.Request())
 
 
-def go_home(bench: Bench) -> bool:
-    """Brings the arm home by an approved proposal; whether it got there."""
-    home = propose_home(bench)
-    if not home.success:
-        return False
+def go_home(bench: Bench) -> str:
+    """Brings the arm home by an approved proposal; why it did not get there, if it did not."""
+    for _ in range(ATTEMPTS):
+        reason = get_home(bench, propose_home(bench))
+        if not is_unheard(bench, reason):
+            break
+    return reason
+
+
+def get_home(bench: Bench, proposed: ProposeHome.Response) -> str:
+    """Approves a way that ends at home; why the arm did not get there, if it did not."""
+    if not proposed.success:
+        return proposed.message
     # The monitor has to know of it.
     bench.operator.spin(0.2)
     after = bench.operator.count("step_result")
-    bench.operator.confirm(home.proposal_id, StepConfirmation.APPROVE)
-    end = bench.operator.next("step_result", after, lambda result: result.proposal_id == home.proposal_id)
-    return end.outcome == StepResult.AT_HOME
+    bench.operator.confirm(proposed.proposal_id, StepConfirmation.APPROVE)
+    end = bench.operator.next("step_result", after, lambda result: result.proposal_id == proposed.proposal_id)
+    if end.outcome != StepResult.AT_HOME:
+        return end.reason
+    wait_for_readings_after(bench, end)
+    bench.home_rad = bench.positions()
+    return ""
+
+
+def wait_for_readings_after(bench: Bench, end: StepResult) -> None:
+    """What is seen from now on is from after the end of a motion."""
+
+    def seconds(stamp: Time) -> tuple[int, int]:
+        return stamp.sec, stamp.nanosec
+
+    bench.operator.until(
+        lambda: seconds(bench.operator.newest("joint_states").header.stamp) > seconds(end.header.stamp), "readings after a motion", 30.0
+    )
+
+
+def is_unheard(bench: Bench, reason: str) -> bool:
+    """Whether somebody was not heard in time, as where the machine is too busy: the arm has to stop then. Waits until it may move again."""
+    unheard = any(words in reason for words in UNHEARD)
+    if unheard:
+        bench.operator.spin(INSIST_S)
+    return unheard
+
+
+def carried_out(bench: Bench, attempt: Callable[[Bench], StepResult]) -> StepResult:
+    """How a step ends; it is tried again where the executor has not heard the driver in time."""
+    for _ in range(ATTEMPTS):
+        end = attempt(bench)
+        if end.outcome != StepResult.FAULT or not is_unheard(bench, end.reason):
+            break
+    return end
 
 
 def propose(bench: Bench, change: Callable[[PickPlace], None] = lambda _: None, disk: tuple[float, float] | None = None) -> PickPlace:
@@ -474,8 +538,19 @@ def propose(bench: Bench, change: Callable[[PickPlace], None] = lambda _: None, 
 def begin_with_disk(bench: Bench) -> None:
     """The arm goes home and begins the next step of the oracle's first goal: a disk that was not picked yet goes to a free place."""
     bench.operator.spin(0.6)
-    if not go_home(bench):
-        raise TimeoutError("the arm does not get home")
+    for _ in range(ATTEMPTS):
+        reason = begin_next_disk(bench)
+        if not is_unheard(bench, reason):
+            break
+    assert not reason, f"the step of a disk does not begin: {reason}"
+
+
+def begin_next_disk(bench: Bench) -> str:
+    """The same, once; why it did not begin, if it did not."""
+    # What is left from an attempt is put down first.
+    reason = get_home(bench, propose_home(bench, "propose_put_down" if bench.vacuum else "propose_home"))
+    if reason:
+        return reason
     goal = first_goal(bench)
     disk, place = DISKS[bench.disks_used % len(DISKS)], FREE_PLACES[bench.disks_used % len(FREE_PLACES)]
     bench.disks_used += 1
@@ -486,7 +561,7 @@ def begin_with_disk(bench: Bench) -> None:
         proposal.place = Pose2D(x=place[0], y=place[1], theta=0.0)
 
     began = begin(bench, lambda bench: propose(bench, of_goal, disk))
-    assert began == "moves", f"the step of a disk does not begin: {began}"
+    return "" if began == "moves" else began
 
 
 def first_goal(bench: Bench) -> Goal:
@@ -512,8 +587,13 @@ def end_of_step(bench: Bench) -> StepResult:
 def hold_disk(bench: Bench) -> None:
     """A disk is held, and on its way through the air."""
     begin_with_disk(bench)
-    bench.operator.until(lambda: bench.vacuum, "vacuum", 30.0)
+    bench.operator.until(lambda: bench.vacuum or has_ended(bench), "vacuum", 30.0)
     bench.operator.spin(1.0)
+
+
+def has_ended(bench: Bench) -> bool:
+    """Whether the executor has said what has become of the proposal that was approved last."""
+    return any(said.proposal_id == bench.proposal.id for said in bench.operator.received["step_result"])
 
 
 def count_step(bench: Bench, times: int = 1) -> None:

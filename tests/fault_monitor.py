@@ -13,6 +13,8 @@ MOVING_RAD = 5e-4
 OVERTAKING_S = 0.05
 # What stands where it is to be placed may be released so long after a stop: that was asked for before the stop.
 RELEASE_S = 0.4
+# Where readings of the suction output are missing for longer than this before a stop, nobody knows on which side of it a change was.
+BLIND_S = 0.2
 # An arm that has not moved for so long has come to rest: what comes then is another motion.
 REST_TIME_S = 0.2
 # Status of a goal in action_msgs/GoalStatus: accepted, executing and cancelling ones move the arm.
@@ -84,6 +86,8 @@ class Monitor:
     # Where the arm was when it last was allowed to move: nothing where it is not any more, and its motion is measured from there.
     _allowed_at: list[float] | None = None
     _suction: bool = False
+    # When the suction output was read last.
+    _suction_read_at: float = 0.0
     # Whether a descent has ended at contact since suction was switched on.
     _is_placed: bool = False
     # Proposals whose approval must not move the arm, and why.
@@ -159,12 +163,14 @@ class Monitor:
     def on_suction(self, on: bool, now: float) -> None:
         """A reading of the output that switches suction: a stop leaves it as it is."""
         was_on, self._suction = self._suction, on
+        before, self._suction_read_at = self._suction_read_at, now
         if on != was_on:
             self._hear(f"suction {'on' if on else 'off'}", now)
         if on and not was_on:
             self._is_placed = False
+        is_after = self._stopped_at is not None and self._stopped_at <= now and self._stopped_at - before <= BLIND_S
         released = self._is_placed and self._stopped_at is not None and now - self._stopped_at <= RELEASE_S
-        if was_on and not on and self._stopped_at is not None and not released:
+        if was_on and not on and is_after and not released:
             text = f"suction is switched off {now - self._stopped_at:.2f} s after a stop: what is held is dropped"
             self._violate(Kind.DROPPED, text, now)
 

@@ -133,6 +133,25 @@ def test_the_monitor_catches_a_part_that_a_stop_drops(monitor: Monitor) -> None:
     assert "suction is switched off 0.50 s after a stop" in str(monitor.violations[0])
 
 
+def test_suction_that_may_have_been_switched_off_before_a_stop_drops_nothing(monitor: Monitor) -> None:
+    monitor.on_approval(2, "anna")
+    monitor.on_suction(True, 1.0)
+    monitor.on_stop(1.5, 0.3)
+    # Heard of late.
+    monitor.on_suction(False, 1.4)
+    monitor.on_suction(True, 2.0)
+    # Nothing was heard from before another stop until after it.
+    monitor.on_stop(3.0, 0.3, again=True)
+    monitor.on_suction(False, 4.0)
+    assert not monitor.violations
+    # One reading after the stop is enough.
+    monitor.on_suction(True, 5.0)
+    monitor.on_stop(5.0, 0.3, again=True)
+    monitor.on_suction(True, 5.1)
+    monitor.on_suction(False, 6.0)
+    assert [found.kind for found in monitor.violations] == [Kind.DROPPED]
+
+
 def test_a_part_that_stands_at_its_place_may_be_released_as_a_stop_comes_and_no_other(monitor: Monitor) -> None:
     monitor.on_approval(2, "anna")
     monitor.on_goals("until", {b"pick": 4}, 1.0, answers_late=True)

@@ -277,7 +277,7 @@ def test_a_goal_is_seen_by_page_and_oracle_and_a_bag_of_the_run_holds_it_as_a_st
     operator.next("heightmap", 0, lambda made: nanoseconds(made.header.stamp) >= nanoseconds(began.stamp))
     goals = operator.count("goal")
     cell.call(cell.load, LoadDemonstration.Request(request_id=name(), path=str(demonstration)))
-    newest_goal(cell, goals, step=1)
+    goal = newest_goal(cell, goals, step=1)
     address = tmp_path / "address"
     start("operator_console", "--ros-args", "-p", "port:=0", "-p", f"address_file:={address}", "-p", "use_sim_time:=true")
     bag = tmp_path / "run"
@@ -289,7 +289,7 @@ def test_a_goal_is_seen_by_page_and_oracle_and_a_bag_of_the_run_holds_it_as_a_st
     operator.until(lambda: operator.has_heard("operator_console", "/heightmap"), "page that sees the cell", 60.0)
     page = console_client().Console(address.read_text().strip(), "a program")
     try:
-        proposal = cell.proposal(pick=DISK)
+        proposal = cell.proposal(pick=DISK, attempt=goal.attempt)
         handle, feedback = cell.send(proposal)
         cell.awaits_approval(feedback)
         operator.until(lambda: (page.state()["proposal"] or {}).get("id") == str(proposal.id), "proposal on the page", 60.0)

@@ -1,6 +1,6 @@
 """A whole run with driver and cameras as they are: whole_run.py PROBLEM SEED MOST_PROPOSALS [CONTACT [CHECKPOINT]].
 
-CONTACT: the executor's `driver.contact`; with `height` the robot is a CB3, whose driver has neither tool contact nor `trajectory_until_node`.
+CONTACT: the executor's `driver.contact`; with `height` the robot is a CB3, which knows no tool contact and no `trajectory_until_node`.
 The demonstration is one of the same cell on another day: as its cameras saw it, with another light and other noise.
 
 Prints its result as a line of JSON, and where it is not complete the logs on standard error.

@@ -457,6 +457,12 @@ mod tests {
             .collect()
     }
 
+    /// Faults of cameras and pairs of them: where one is off, noise of the whole may be red too.
+    fn of_cameras(mut faults: Vec<String>) -> Vec<String> {
+        faults.retain(|fault| !fault.ends_with("all cameras"));
+        faults
+    }
+
     #[test]
     fn a_cell_in_order_is_green_and_a_moved_camera_red() {
         let cameras = Camera::ravens();
@@ -516,15 +522,12 @@ mod tests {
                 for _ in 0..3 {
                     let mut wrong = cameras.clone();
                     wrong[index] = off(&cameras[index], 5e-3, 0.5f64.to_radians(), &mut rng);
-                    let found = faults(&wrong, &frames);
+                    let found = of_cameras(faults(&wrong, &frames));
                     let name = &cameras[index].name;
-                    assert!(
-                        found.iter().any(|fault| fault.contains(name.as_str())),
-                        "{seed} {name}: {found:?}"
-                    );
+                    assert!(!found.is_empty(), "{seed} {name}");
                     // Nobody else is blamed.
-                    let innocent = |fault: &String| !fault.contains(name.as_str());
-                    assert!(!found.iter().any(innocent), "{seed} {name}: {found:?}");
+                    let is_named = |fault: &String| fault.contains(name.as_str());
+                    assert!(found.iter().all(is_named), "{seed} {name}: {found:?}");
                 }
             }
         }
@@ -537,9 +540,9 @@ mod tests {
         aside[0].world_from_camera.translation.y += 0.005;
         let noise = realsense(&cameras, 2);
         let without = frames(&cameras, Some(&noise), 10, false);
-        assert_eq!(faults(&aside, &without), Vec::<String>::new());
+        assert_eq!(of_cameras(faults(&aside, &without)), Vec::<String>::new());
         let with = frames(&cameras, Some(&noise), 10, true);
-        let found = faults(&aside, &with);
+        let found = of_cameras(faults(&aside, &with));
         assert_eq!(found, ["board front and left", "board front and right"]);
     }
 

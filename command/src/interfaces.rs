@@ -360,6 +360,13 @@ fn policy(nodes: &[(&str, BTreeSet<Endpoint>)]) -> String {
     let cameras = nodes.iter().find(|(node, _)| *node == "camera_fusion");
     for (node, endpoints) in nodes {
         let mut endpoints = endpoints.clone();
+        // ros2-client reads it whatever the node's time is.
+        endpoints.insert(Endpoint {
+            role: Role::Subscribes,
+            name: "/clock".to_owned(),
+            type_name: "rosgraph_msgs/msg/Clock".to_owned(),
+            qos: "best effort".to_owned(),
+        });
         if let (&"operator_console", Some((_, of_cameras))) = (node, cameras) {
             // It asks for their images only while somebody looks at them.
             let read = of_cameras
@@ -543,10 +550,7 @@ mod tests {
                 "<topics publish=\"ALLOW\">",
                 "<topic>step_confirmation</topic>",
             ),
-            (
-                "<topics subscribe=\"ALLOW\">",
-                "<topic>front/color/image_raw</topic>",
-            ),
+            ("<topics subscribe=\"ALLOW\">", "<topic>/clock</topic>"),
             (
                 "<services reply=\"ALLOW\">",
                 "<service>~/get_parameters</service>",
@@ -559,6 +563,8 @@ mod tests {
             let at = lines.iter().position(|line| *line == right);
             assert_eq!(lines[at.expect(right) + 1], name);
         }
+        // It looks at the cameras where somebody looks at it.
+        assert!(lines.contains(&"<topic>front/color/image_raw</topic>"));
         let (fusion, _) = text.split_once("/sctn/operator_console").unwrap();
         assert!(!fusion.contains("publish"), "{fusion}");
     }

@@ -21,10 +21,8 @@ use step_protocol::{Goal, Observation, Proposal, StepOutcome, StepResult};
 const PROPOSAL_MS: u32 = 900;
 const RESULT_MS: u32 = 500;
 const END_MS: u32 = 2500;
-/// Magnification of a heightmap's cells.
-const SCALE: u32 = 2;
 /// Width of the border that shows the result (pixels).
-const BORDER_PX: u32 = 6;
+const BORDER_PX: u32 = 4;
 const WAITING: Rgb<u8> = Rgb([90, 90, 90]);
 const PLACED: Rgb<u8> = Rgb([40, 170, 70]);
 const FAILED: Rgb<u8> = Rgb([205, 50, 45]);
@@ -161,7 +159,8 @@ impl Writer {
     }
 
     fn shoot(&mut self, picture: &RgbImage, border: Rgb<u8>, shown_ms: u32) -> Result<()> {
-        let (width, height) = (picture.width() * SCALE, picture.height() * SCALE);
+        // Nearest neighbours: no new colours, so that the palette of a frame holds them all.
+        let (width, height) = (picture.width() / 2, picture.height() / 2);
         let scaled = imageops::resize(picture, width, height, FilterType::Nearest);
         let around = 2 * BORDER_PX;
         let mut framed = RgbImage::from_pixel(width + around, height + around, border);

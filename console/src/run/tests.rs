@@ -151,7 +151,11 @@ fn a_run_goes_from_proposal_to_approval_motion_confirmation_and_its_end() {
 fn a_proposal_that_comes_before_its_goal_is_shown_with_it() {
     let mut run = proposed();
     run.on_proposal(proposal(8, 2, 0, 20)).unwrap();
-    assert_eq!(run.phase(), RunPhase::AwaitingProposal);
+    // The present one stands as long as its goal does.
+    assert_eq!(
+        (run.phase(), run.current_id()),
+        (RunPhase::Proposed, Some(id(7)))
+    );
     run.on_goal(goal(2, 0, 20), NOW).unwrap();
     assert_eq!(
         (run.phase(), run.current_id()),
@@ -282,11 +286,13 @@ fn who_made_a_proposal_and_how_likely_it_succeeds_is_shown() {
 #[test]
 fn a_goal_that_looks_reached_and_a_policy_that_does_not_know_are_shown() {
     let mut run = proposed();
+    let mut number = 7;
     let mut verdict = |success: Option<f32>, done: Option<f32>| {
+        number += 1;
         let made = Proposal {
             success_probability: success,
             done_probability: done,
-            ..proposal(8, 1, 0, 10)
+            ..proposal(number, 1, 0, 10)
         };
         run.on_proposal(made).unwrap();
         let shown = serde_json::to_value(run.snapshot(NOW)).unwrap();

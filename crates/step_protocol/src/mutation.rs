@@ -43,14 +43,12 @@ pub(crate) enum Mutation {
     ContinuedStaysStopped,
     /// A proposal for another goal hides that for the present one from the page.
     OtherGoalHidesProposal,
-    /// A page waits for ever where what follows a decision was lost.
-    SilenceIsNotProbed,
 }
 
 impl Mutation {
     /// All of them.
     #[cfg(test)]
-    pub(crate) const ALL: [Self; 21] = [
+    pub(crate) const ALL: [Self; 20] = [
         Self::ApprovalMovesTwice,
         Self::SupersededStaysPending,
         Self::WaitingSurvivesStop,
@@ -71,7 +69,6 @@ impl Mutation {
         Self::UnansweredIsForgotten,
         Self::ContinuedStaysStopped,
         Self::OtherGoalHidesProposal,
-        Self::SilenceIsNotProbed,
     ];
 }
 

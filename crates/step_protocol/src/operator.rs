@@ -123,6 +123,8 @@ enum Standing {
 struct Known {
     proposal: Proposal,
     standing: Standing,
+    /// The goal tracker does not know it: its decisions do not count, and it hides no other proposal.
+    unknown_to_tracker: bool,
 }
 
 /// A decision that nothing has come of yet.
@@ -253,11 +255,10 @@ impl Operator {
             is_for(&known.proposal, goal) && known.proposal.stamp >= goal.stamp && !is_hidden
         };
         let of_goal = || self.proposals.iter().rev().filter(of_goal);
-        let is_at_work = |known: &&Known| {
-            matches!(
-                known.standing,
-                Standing::Approved | Standing::Moved(_) | Standing::Judged(_)
-            )
+        let is_at_work = |known: &&Known| match known.standing {
+            Standing::Approved | Standing::Judged(_) => true,
+            Standing::Moved(_) => !known.unknown_to_tracker,
+            Standing::Open | Standing::Closed => false,
         };
         let is_unanswered = |known: &&Known| {
             let mut unanswered = self.unanswered.iter();
@@ -275,8 +276,8 @@ impl Operator {
         // The same one, latched again, answers nothing.
         if self.goal.as_ref() != Some(goal) {
             self.stopped = false;
-            self.unanswered.clear();
             self.quiet_since = None;
+            self.end_decisions();
         }
         self.goal = Some(goal.clone());
         let is_confirmed = |motion: &mut Motion| motion.result.stamp <= goal.stamp;
@@ -319,7 +320,10 @@ impl Operator {
         let question = self.asked.then(|| Question::Approve(proposal.clone()));
         self.proposals.push_back(Known {
             proposal,
-            standing: before.map_or(Standing::Open, |before| before.standing),
+            standing: before
+                .as_ref()
+                .map_or(Standing::Open, |before| before.standing),
+            unknown_to_tracker: before.is_some_and(|before| before.unknown_to_tracker),
         });
         question
     }
@@ -398,7 +402,9 @@ impl Operator {
     /// The goal tracker has refused a decision on a step; `kind` is none where this version does not know it.
     pub fn on_confirmation_refused(&mut self, id: ProposalId, kind: Option<RefusalKind>) {
         self.quiet_since = None;
-        self.unanswered.retain(|asked| asked.id != id);
+        // An approval or a rejection is the executor's to answer.
+        self.unanswered
+            .retain(|asked| asked.id != id || Judgement::from_decision(asked.decision).is_none());
         match kind {
             // The question is still open.
             Some(RefusalKind::Unknown) => {
@@ -406,6 +412,7 @@ impl Operator {
                     && let Standing::Judged(outcome) = known.standing
                 {
                     known.standing = Standing::Moved(outcome);
+                    known.unknown_to_tracker = true;
                 }
             }
             Some(RefusalKind::Stopped) => {
@@ -430,6 +437,21 @@ impl Operator {
         Some((asked.id, asked.decision))
     }
 
+    /// Another goal has come: it answers what was decided on a step. What was approved for the goal before may come to nothing; the
+    /// executor says what has become of it.
+    fn end_decisions(&mut self) {
+        for asked in std::mem::take(&mut self.unanswered) {
+            if asked.decision == OperatorDecision::Approve {
+                self.reopen(asked);
+            }
+        }
+        for known in &mut self.proposals {
+            if let Standing::Judged(_) = known.standing {
+                known.standing = Standing::Closed;
+            }
+        }
+    }
+
     /// The proposal stands where it stood before the decision.
     fn reopen(&mut self, asked: Unanswered) {
         if let (Some(before), Some(known)) = (asked.before, self.known_mut(asked.id)) {
@@ -442,17 +464,28 @@ impl Operator {
     /// everybody.
     pub fn probe(&mut self, now: Duration) -> Option<ProposalId> {
         let waits = self.phase() == RunPhase::AwaitingProposal && self.unanswered.is_empty();
-        let current = self.current().map(|current| current.id);
-        let Some(id) = current.filter(|_| waits) else {
+        let Some(id) = self.to_be_probed().filter(|_| waits) else {
             self.quiet_since = None;
             return None;
         };
         let since = *self.quiet_since.get_or_insert(now);
-        if now.saturating_sub(since) <= FOLLOWED_WITHIN || planted(Mutation::SilenceIsNotProbed) {
+        if now.saturating_sub(since) <= FOLLOWED_WITHIN {
             return None;
         }
         self.quiet_since = Some(now);
         Some(id)
+    }
+
+    /// The one that was judged; else each proposal for the present goal in turn, as each may be of another author.
+    fn to_be_probed(&self) -> Option<ProposalId> {
+        let (current, goal) = (self.current_known()?, self.goal.as_ref()?);
+        if let Standing::Judged(_) = current.standing {
+            return Some(current.proposal.id);
+        }
+        let proposals = self.proposals.iter().map(|known| &known.proposal);
+        let of_goal = proposals.filter(|proposal| is_for(proposal, goal));
+        let refusal = |proposal: &&Proposal| self.refused.iter().position(|id| *id == proposal.id);
+        of_goal.min_by_key(refusal).map(|proposal| proposal.id)
     }
 
     /// The executor's word on a proposal. The refusal of one that was carried out before says that its result was lost.

@@ -531,3 +531,68 @@ fn a_stop_opens_what_was_not_answered_and_a_refused_judgement_is_asked_for_once_
     });
     assert_eq!(operator.phase(), RunPhase::AwaitingConfirmation);
 }
+
+#[test]
+fn the_refusal_of_a_judgement_answers_no_approval() {
+    let mut operator = at_page();
+    operator.decide(&says(OperatorDecision::Approve, 7), NOW);
+    // Somebody has judged what has not moved yet.
+    operator.on_confirmation_refused(ProposalId(7), Some(RefusalKind::Twice));
+    let approval = Some((ProposalId(7), OperatorDecision::Approve));
+    assert_eq!(operator.ask_again(LATE), approval);
+    assert_eq!(operator.phase(), RunPhase::Proposed);
+}
+
+#[test]
+fn a_motion_that_the_tracker_does_not_know_hides_no_other_proposal() {
+    let mut operator = at_page();
+    operator.on_result(placed(7));
+    operator.decide(&says(OperatorDecision::Advance, 7), NOW);
+    operator.on_confirmation_refused(ProposalId(7), Some(RefusalKind::Unknown));
+    assert_eq!(operator.phase(), RunPhase::AwaitingConfirmation);
+    operator.on_proposal(proposal(8, 30));
+    assert_eq!(
+        (operator.phase(), current(&operator)),
+        (RunPhase::Proposed, Some(8))
+    );
+}
+
+#[test]
+fn where_the_same_goal_comes_again_nothing_decided_before_holds_the_run_up() {
+    let mut operator = at_page();
+    let second = Goal {
+        step: 2,
+        ..goal(3, 0)
+    };
+    operator.decide(&says(OperatorDecision::Approve, 7), NOW);
+    operator.on_goal(&second);
+    assert_eq!(operator.ask_again(LATE), None);
+    // The goal tracker was started again.
+    operator.on_goal(&goal(3, 0));
+    assert_eq!(operator.phase(), RunPhase::Proposed);
+    operator.on_result(placed(7));
+    operator.decide(&says(OperatorDecision::Advance, 7), NOW);
+    operator.on_goal(&second);
+    operator.on_goal(&goal(3, 0));
+    operator.on_proposal(proposal(8, 30));
+    assert_eq!(current(&operator), Some(8));
+}
+
+#[test]
+fn in_silence_each_proposal_for_the_goal_is_rejected_once_more_in_turn() {
+    let mut operator = at_page();
+    operator.on_proposal(proposal(8, 10));
+    let refused = |id| StepResult {
+        status: Some(ProposalStatus::Superseded),
+        ..result(id, StepOutcome::Refused)
+    };
+    operator.on_result(refused(7));
+    operator.on_result(refused(8));
+    let mut now = NOW;
+    for id in [7, 8, 7] {
+        assert_eq!(operator.probe(now), None);
+        now += LATE;
+        assert_eq!(operator.probe(now), Some(ProposalId(id)));
+        operator.on_result(refused(id));
+    }
+}

@@ -194,6 +194,8 @@ struct World {
     operators: [Operator; 2],
     /// Which of them are people at a page.
     at_page: [bool; 2],
+    /// The proposals that each has heard to be refused.
+    refused: [BTreeSet<ProposalId>; 2],
     inboxes: [VecDeque<Message>; 5],
     job: Option<Job>,
     robot: Robot,
@@ -309,6 +311,7 @@ impl World {
             gate: gate(),
             operators: at_page.map(|at_page| Operator::new(!at_page)),
             at_page,
+            refused: Default::default(),
             inboxes: Default::default(),
             job: None,
             robot: Robot {
@@ -436,6 +439,7 @@ impl World {
             }
             Party::Operator(index) => {
                 self.operators[index] = Operator::new(!self.at_page[index]);
+                self.refused[index].clear();
             }
         }
         self.send_latched(party);
@@ -454,6 +458,11 @@ impl World {
             Party::Planner => self.planner_receives(message),
             Party::Gate => self.gate_receives(message),
             Party::Operator(index) => {
+                if let Message::Result(result) = &message
+                    && result.outcome == StepOutcome::Refused
+                {
+                    self.refused[index].insert(result.proposal_id);
+                }
                 let operator = &mut self.operators[index];
                 let question = match message {
                     Message::Goal(goal) => {
@@ -520,12 +529,14 @@ impl World {
         let Some(id) = operator.current().map(|proposal| proposal.id) else {
             return self.continue_run(index);
         };
-        let is_planned = self.robot.rehearsed == Some(id);
+        // In the end the person wants another one than one that was refused.
+        let is_good = !(self.fair && self.refused[index].contains(&id));
+        let is_planned = self.robot.rehearsed == Some(id) && is_good;
         let decision = match (operator.phase(), whim % 8) {
             (RunPhase::Proposed, 1) => OperatorDecision::Reject,
             (RunPhase::Proposed | RunPhase::Moving, 2) => OperatorDecision::Stop,
             (RunPhase::Proposed, _) if is_planned => OperatorDecision::Approve,
-            // Its motion is shown soon; in the end the person wants another one.
+            // Its motion is shown soon, or never.
             (RunPhase::Proposed, _) if self.fair => OperatorDecision::Reject,
             (RunPhase::AwaitingConfirmation | RunPhase::Fault, 1..4) => OperatorDecision::Retry,
             (RunPhase::AwaitingConfirmation | RunPhase::Fault, _) => OperatorDecision::Advance,

@@ -413,6 +413,10 @@ impl Rehearsal<'_> {
     fn turn(&mut self, command: &Command, ends: Outcome) -> Result<Report, Box<Collision>> {
         self.lose();
         let Command::FollowUntilContact(descent) = command else {
+            if ends == Outcome::GraspFailed {
+                // The tool was lifted straight up beside what stands there, and goes on straight up.
+                self.contact = Some(self.contact_here());
+            }
             return Ok(Report::Holds(false));
         };
         // As far down as contact may come, or none: what was seen may be lower.

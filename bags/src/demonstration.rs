@@ -136,8 +136,7 @@ impl Demonstration {
         name
     }
 
-    /// Indices of the steps after which an image is a goal: see [`step_protocol::goal_steps`].
-    pub fn goal_steps(&self) -> Vec<usize> {
+    fn goal_steps(&self) -> Vec<usize> {
         goal_steps(self.steps.iter().map(|step| step.delta_reward))
     }
 

@@ -1,10 +1,10 @@
 //! `sctn decide`.
 
-use crate::policy::PolicyArguments;
 use crate::root::Root;
 use anyhow::{Context as _, Result};
 use bags::Demonstration;
 use clap::Args;
+use gctn::Policy;
 use learning::goal;
 use nalgebra::Isometry2;
 use serde::Serialize;
@@ -15,8 +15,9 @@ use std::path::PathBuf;
 pub struct Decide {
     /// Bag of a demonstration or of a recorded run
     bag: PathBuf,
-    #[command(flatten)]
-    policy: PolicyArguments,
+    /// Checkpoint of the policy [default: the shipped one]
+    #[arg(long)]
+    checkpoint: Option<PathBuf>,
 }
 
 /// What a policy decides before a step, shown what the demonstration reached next.
@@ -35,7 +36,8 @@ struct Step {
 
 impl Decide {
     pub fn run(self, root: &Root) -> Result<()> {
-        let policy = self.policy.load(root)?;
+        let checkpoint = self.checkpoint.unwrap_or_else(|| root.shipped_checkpoint());
+        let policy = Policy::load(&checkpoint)?;
         let demonstration = Demonstration::read(&self.bag)?;
         let goals = demonstration.goals();
         let first = demonstration.observation(0);

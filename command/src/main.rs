@@ -23,7 +23,6 @@ mod latency;
 mod launch;
 mod operate;
 mod picture;
-mod policy;
 mod problems;
 mod progress;
 mod publish;

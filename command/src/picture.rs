@@ -1,7 +1,6 @@
 //! `sctn picture`: what the cameras, the fusion, the demonstrator and the policy make of a problem.
 
 use crate::demos::demonstration;
-use crate::policy::PolicyArguments;
 use crate::root::Root;
 use anyhow::{Context, Result};
 use clap::Args;
@@ -24,8 +23,9 @@ pub struct Picture {
     /// Step of the demonstration to draw, from 1
     #[arg(long, default_value_t = 1)]
     step: usize,
-    #[command(flatten)]
-    policy: PolicyArguments,
+    /// Checkpoint of the policy [default: the shipped one]
+    #[arg(long)]
+    checkpoint: Option<PathBuf>,
     /// Folder for the pictures
     #[arg(long)]
     out: PathBuf,
@@ -70,8 +70,9 @@ impl Picture {
         };
         write("heightmap.png", &both(&step.observation))?;
         write("goal.png", &both(image))?;
+        let checkpoint = self.checkpoint.unwrap_or_else(|| root.shipped_checkpoint());
         gctn::set_threads(1);
-        let policy = self.policy.load(root)?;
+        let policy = Policy::load(&checkpoint)?;
         let conditioning = policy.config().conditioning;
         let goal = goal(shown.observation(0), &goals, earned, conditioning);
         let goal = goal.context("a demonstration without a goal")?;

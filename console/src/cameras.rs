@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
-use heightmap::{Intrinsics, TransformError, Transforms};
+use heightmap::{Distortion, Intrinsics, TransformError, Transforms};
 use nalgebra::Isometry3;
 use serde::Serialize;
 
@@ -49,11 +49,9 @@ pub struct CameraState {
     fy_px: f64,
     cx_px: f64,
     cy_px: f64,
-    /// Model of the lens, as in `CameraInfo`.
-    distortion_model: &'static str,
-    /// Its coefficients, in the order of `CameraInfo.d`.
-    distortion: Vec<f64>,
-    /// Pose of the optical frame in the world, row by row: rotation and translation (m); `None` where it is not known.
+    /// Lens after plumb_bob: k1, k2, p1, p2, k3.
+    distortion: [f64; 5],
+    /// Pose of the optical frame in the world, row by row: rotation and translation (m); nothing where it is not known.
     pose: Option<[[f64; 4]; 3]>,
 }
 
@@ -93,7 +91,7 @@ impl Cameras {
                 fy_px,
                 cx_px,
                 cy_px,
-                distortion,
+                distortion: Distortion { k1, k2, p1, p2, k3 },
             } = seen.intrinsics?;
             let pose = state.transforms.world_from(&seen.frame, &self.world_frame);
             let pose = pose.ok().map(|pose| {
@@ -109,8 +107,7 @@ impl Cameras {
                 fy_px,
                 cx_px,
                 cy_px,
-                distortion_model: distortion.model(),
-                distortion: distortion.coefficients(),
+                distortion: [k1, k2, p1, p2, k3],
                 pose,
             })
         };

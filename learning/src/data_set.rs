@@ -121,7 +121,7 @@ pub enum DataSetError {
     Io {
         /// The folder.
         path: PathBuf,
-        /// The reason.
+        /// Why.
         source: std::io::Error,
     },
     /// Fewer demonstrations than asked for.

@@ -127,7 +127,7 @@ pub enum RecipeError {
     Io {
         /// The file.
         path: PathBuf,
-        /// The reason.
+        /// Why.
         source: std::io::Error,
     },
     /// Not YAML, an unknown field, or a field of another type.
@@ -159,7 +159,7 @@ pub enum RecipeError {
     Field {
         /// The file.
         path: PathBuf,
-        /// The field.
+        /// Which.
         field: String,
         /// Its value.
         value: String,

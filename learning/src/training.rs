@@ -120,7 +120,7 @@ pub enum TrainingError {
     Io {
         /// The file or folder.
         path: PathBuf,
-        /// The reason.
+        /// Why.
         source: std::io::Error,
     },
     /// The network, its optimiser or a checkpoint.

@@ -3,12 +3,12 @@
 use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
-use step_protocol::{OperatorDecision, RunPhase};
+use step_protocol::OperatorDecision;
 
-use super::Run;
 use super::outcome::sentence;
 use super::view::TableChange;
-use crate::refusal::{Refusal, advice_on};
+use super::{Run, Status};
+use crate::refusal::{Refusal, advice};
 
 /// What an operator decides, as the API names it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
@@ -56,7 +56,46 @@ impl From<Decision> for OperatorDecision {
     }
 }
 
+/// How far the run is.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
+#[serde(rename_all = "snake_case")]
+pub enum Phase {
+    /// No goal has come.
+    NoGoal,
+    /// The policy has not proposed anything for the present goal.
+    AwaitingProposal,
+    /// A proposal waits for the operator.
+    Proposed,
+    /// The approved proposal is being carried out.
+    Moving,
+    /// The arm has moved: the operator says whether the step succeeded.
+    AwaitingConfirmation,
+    /// The motion broke off by itself.
+    Fault,
+    /// An operator has ended the run.
+    Stopped,
+    /// All steps are done.
+    Complete,
+}
+
 impl Run {
+    /// How far the run is.
+    pub fn phase(&self) -> Phase {
+        match &self.goal {
+            None => return Phase::NoGoal,
+            Some(goal) if goal.complete => return Phase::Complete,
+            Some(_) if self.stopped => return Phase::Stopped,
+            Some(_) => {}
+        }
+        match self.current().map(|offered| &offered.status) {
+            None | Some(Status::Closed | Status::Confirmed { .. }) => Phase::AwaitingProposal,
+            Some(Status::Open) => Phase::Proposed,
+            Some(Status::Approved) => Phase::Moving,
+            Some(Status::Moved { fault: false }) => Phase::AwaitingConfirmation,
+            Some(Status::Moved { fault: true }) => Phase::Fault,
+        }
+    }
+
     /// Whether a decision would be taken now; else why not.
     ///
     /// # Errors
@@ -64,11 +103,11 @@ impl Run {
     pub fn check(&self, decision: Decision, now: Duration) -> Result<(), Refusal> {
         let phase = self.phase();
         let allowed = match decision {
-            Decision::Approve | Decision::Reject => phase == RunPhase::Proposed,
+            Decision::Approve | Decision::Reject => phase == Phase::Proposed,
             Decision::Advance | Decision::Retry => {
-                matches!(phase, RunPhase::AwaitingConfirmation | RunPhase::Fault)
+                matches!(phase, Phase::AwaitingConfirmation | Phase::Fault)
             }
-            Decision::Stop => !matches!(phase, RunPhase::Complete | RunPhase::NoGoal),
+            Decision::Stop => !matches!(phase, Phase::Complete | Phase::NoGoal),
         };
         if !allowed {
             return Err(out_of_phase(phase));
@@ -99,14 +138,14 @@ impl Run {
         (!reason.is_empty()).then(|| {
             Refusal::new(
                 format!("The motion cannot be planned: {}", sentence(reason)),
-                advice_on(reason),
+                advice(reason),
             )
         })
     }
 
     /// Why the present proposal is stale: the table has changed since the heightmap that it was made from.
     fn change(&self) -> Option<Refusal> {
-        let reason = match self.present_change()? {
+        let reason = match self.current()?.change? {
             TableChange::Blob(change) => format!(
                 "The proposal is stale: the table has changed about ({:.3}, {:.3}) m since the picture that it was made from.",
                 change.center_m.x, change.center_m.y
@@ -149,13 +188,13 @@ impl Run {
         (message != "ready").then(|| {
             Refusal::new(
                 format!("The robot is not ready: {}", sentence(message)),
-                advice_on(message),
+                advice(message),
             )
         })
     }
 
-    pub(super) fn headline(&self, phase: RunPhase) -> (String, &'static str) {
-        let step = match self.goal() {
+    pub(super) fn headline(&self, phase: Phase) -> (String, &'static str) {
+        let step = match &self.goal {
             Some(goal) if goal.attempt > 0 => format!(
                 "Step {} of {}, attempt {}",
                 goal.step,
@@ -166,64 +205,64 @@ impl Run {
             None => String::new(),
         };
         match phase {
-            RunPhase::NoGoal => (
+            Phase::NoGoal => (
                 "No goal yet".into(),
                 "The goal oracle has no demonstration. Load one, or start it with one.",
             ),
-            RunPhase::AwaitingProposal => (
+            Phase::AwaitingProposal => (
                 format!("{step}: waiting for a proposal"),
                 "The policy looks at the table.",
             ),
-            RunPhase::Proposed => (
+            Phase::Proposed => (
                 format!("{step}: the policy proposes a move"),
                 "Look at pick and place in the picture. Approve it if it brings the table closer to the goal, else reject it.",
             ),
-            RunPhase::Moving => (
+            Phase::Moving => (
                 format!("{step}: the arm moves"),
                 "Watch the cell. Stop if anything is wrong.",
             ),
-            RunPhase::AwaitingConfirmation => (
+            Phase::AwaitingConfirmation => (
                 format!("{step}: did it succeed?"),
                 "Compare the present view with the goal. Next step if it succeeded, try again if not.",
             ),
-            RunPhase::Fault => (
+            Phase::Fault => (
                 format!("{step}: the robot broke the motion off"),
                 "Look at the cell. When it is safe, bring the arm home, then try the step again.",
             ),
-            RunPhase::Stopped => (
+            Phase::Stopped => (
                 format!("{step}: stopped"),
                 "Look at the cell. When it is safe, bring the arm home, then continue.",
             ),
-            RunPhase::Complete => ("All steps are done".into(), "Nothing is left to do."),
+            Phase::Complete => ("All steps are done".into(), "Nothing is left to do."),
         }
     }
 }
 
-pub(super) fn out_of_phase(phase: RunPhase) -> Refusal {
+pub(super) fn out_of_phase(phase: Phase) -> Refusal {
     let (reason, advice) = match phase {
-        RunPhase::NoGoal => ("There is no goal.", "Load a demonstration first."),
-        RunPhase::AwaitingProposal => (
+        Phase::NoGoal => ("There is no goal.", "Load a demonstration first."),
+        Phase::AwaitingProposal => (
             "There is no proposal to decide on.",
             "Wait for the policy's next proposal.",
         ),
-        RunPhase::Proposed => (
+        Phase::Proposed => (
             "The proposal has not been carried out.",
             "Approve it or reject it first.",
         ),
-        RunPhase::Moving => ("The arm is moving.", "Wait until it is back, or stop it."),
-        RunPhase::AwaitingConfirmation => (
+        Phase::Moving => ("The arm is moving.", "Wait until it is back, or stop it."),
+        Phase::AwaitingConfirmation => (
             "The proposal was already carried out.",
             "Say whether the step succeeded.",
         ),
-        RunPhase::Fault => (
+        Phase::Fault => (
             "The robot broke the motion off.",
             "Bring the arm home, then try the step again.",
         ),
-        RunPhase::Stopped => (
+        Phase::Stopped => (
             "The run is stopped.",
             "Continue the run with the present step.",
         ),
-        RunPhase::Complete => ("All steps are done.", "Nothing is left to do."),
+        Phase::Complete => ("All steps are done.", "Nothing is left to do."),
     };
     Refusal::new(reason, advice)
 }

@@ -15,7 +15,7 @@ pub enum CalibrationFileError {
     File {
         /// The file.
         path: String,
-        /// The reason.
+        /// Why.
         source: io::Error,
     },
     /// It holds something else.
@@ -45,7 +45,7 @@ struct PoseEntry {
 /// `cameras: {front: {translation_m: [x, y, z], rotation_xyzw: [x, y, z, w]}}`.
 ///
 /// # Errors
-/// The file cannot be read, or does not have this form.
+/// When the file cannot be read, or is none of that kind.
 pub fn read_calibration(
     path: &Path,
 ) -> Result<BTreeMap<String, Isometry3<f64>>, CalibrationFileError> {

@@ -130,15 +130,15 @@ pub enum Error {
     Io {
         /// The file.
         path: PathBuf,
-        /// The reason.
+        /// Why.
         source: std::io::Error,
     },
     /// The device cannot be used.
     #[error("device {device} cannot be used: {problem}")]
     NoCuda {
-        /// The device.
+        /// Which.
         device: crate::Device,
-        /// The reason.
+        /// Why.
         problem: String,
     },
     /// libtorch refused.

@@ -3,10 +3,12 @@
 //! [`step_protocol::ApprovalGate`] decides what may move, without middleware; the rest moves it through the driver's own
 //! topics, service and actions, and reports.
 
-mod cell;
+mod dry_run;
 mod node;
 mod parameters;
+mod presence;
 mod stop_memory;
+mod surface;
 
 pub use node::{ExecutorNode, configure};
-pub use parameters::{JointLimits, Limits, SuctionExecutorParameters};
+pub use parameters::{Contact, Limits, SuctionExecutorParameters};

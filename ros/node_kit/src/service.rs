@@ -59,7 +59,7 @@ pub enum CallError {
     Middleware {
         /// Service or action.
         name: String,
-        /// The reason.
+        /// Why.
         reason: String,
     },
     /// The action server does not want this goal.

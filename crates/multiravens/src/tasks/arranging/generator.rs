@@ -88,7 +88,7 @@ pub enum GenerateError {
     File {
         /// The file.
         file: String,
-        /// The reason.
+        /// Why.
         reason: String,
     },
     /// Ranges that nothing fits in.

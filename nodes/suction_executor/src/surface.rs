@@ -2,7 +2,10 @@
 
 use heightmap::Heightmap;
 use nalgebra::Point2;
-use pick_place::{ContactSettings, ContactSign, PickPlace, Touchdown};
+use pick_place::{PickPlace, Touchdown};
+use ur_driver::ContactSign;
+
+use crate::parameters::Contact;
 
 /// The cup rests on what is this near (m).
 const CUP_RADIUS_M: f64 = 0.008;
@@ -15,14 +18,14 @@ const TOP: f64 = 0.9;
 /// Of the cells beside an object this share is lower than its ground.
 const GROUND: f64 = 0.05;
 
-/// How the tip comes down for an action; `None` where the descents are to be fast to their end.
+/// How the tip comes down for an action; nothing where the descents are to be fast to their end.
 ///
 /// # Errors
 /// Names the pose at which nothing was seen.
-pub fn touchdown(
+pub(crate) fn touchdown(
     heightmap: &Heightmap,
     action: &PickPlace,
-    contact: &ContactSettings,
+    contact: &Contact,
     sign: ContactSign,
 ) -> Result<Option<Touchdown>, String> {
     if contact.slow_from_m <= 0.0 {
@@ -55,12 +58,12 @@ pub fn touchdown(
     }))
 }
 
-/// The height of what the cup meets at a point (m); `None` where none was seen.
+/// The height of what the cup meets at a point (m); nothing where none was seen.
 pub(crate) fn top_m(heightmap: &Heightmap, at: &Point2<f64>) -> Option<f64> {
     quantile_m(heightmap, at, CUP_RADIUS_M, TOP)
 }
 
-/// The height that a share of the cells around a point do not exceed (m); `None` where none was seen.
+/// The height that a share of the cells around a point do not exceed (m); nothing where none was seen.
 fn quantile_m(
     heightmap: &Heightmap,
     center: &Point2<f64>,
@@ -118,10 +121,10 @@ mod tests {
         }
     }
 
-    fn slow() -> ContactSettings {
-        ContactSettings {
+    fn slow() -> Contact {
+        Contact {
             slow_from_m: 0.03,
-            ..ContactSettings::default()
+            ..Contact::default()
         }
     }
 
@@ -160,9 +163,9 @@ mod tests {
 
     #[test]
     fn without_a_slow_part_the_surfaces_do_not_count_and_contact_has_to_be_sensed() {
-        let fast = ContactSettings {
+        let fast = Contact {
             slow_from_m: 0.0,
-            ..ContactSettings::default()
+            ..Contact::default()
         };
         let of = |sign| touchdown(&table(), &action(), &fast, sign);
         assert_eq!(of(ContactSign::UntilAction), Ok(None));

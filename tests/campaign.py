@@ -29,12 +29,13 @@ import time
 from collections.abc import Iterator
 
 import lossy_link
-from campaign_cell import Bench, Layout, begin, go_home, recover, working_cell
+from campaign_cell import Bench, Layout, begin, begin_from_home, recover, working_cell
 from campaign_faults import (
     FAULTS,
     LAYOUTS,
     Fault,
     another_executor,
+    approval_of_another,
     kill_executor,
     robot,
     spoofed_approvals,
@@ -50,8 +51,6 @@ from fault_monitor import Kind, Violation
 WATCH_S = 2.5
 # A motion of these proposals takes some 10 s.
 LATEST_S = 9.0
-# The last messages arrive within this time.
-LAST_MESSAGES_S = 0.2
 # How much of the executor's log is shown after a violation.
 LOG_CHARACTERS = 3000
 # Faults that follow each other in one cell.
@@ -61,6 +60,7 @@ FAULTS_OF_A_CELL = 8
 PLANTED = {
     "MovesUnapproved": (stop, 1.0, Kind.UNAPPROVED),
     "AnyApproval": (superseded_approval, 1.0, Kind.UNAPPROVED),
+    "AnyOperator": (approval_of_another, 1.0, Kind.UNAPPROVED),
     "ApprovesSuperseded": (superseded_approval, 1.0, Kind.UNAPPROVED),
     "ApprovesTwice": (spoofed_approvals, 1.0, Kind.UNAPPROVED),
     "IgnoresStop": (stop, 0.5, Kind.AFTER_STOP),
@@ -83,13 +83,8 @@ def inject(bench: Bench, fault: Fault, moment_s: float) -> str:
     fault(bench)
     bench.operator.spin(WATCH_S)
     recover(bench)
-    went_on = begin(bench)
-    if went_on == "moves":
-        return "resumed"
-    # From where the fault has left it the arm may not get to the pick: it goes home first.
-    if go_home(bench) and begin(bench) == "moves":
-        return f"resumed from home ({went_on})"
-    return went_on
+    went_on = begin_from_home(bench)
+    return f"resumed{went_on.removeprefix('moves')}" if went_on.startswith("moves") else went_on
 
 
 @dataclasses.dataclass(frozen=True)
@@ -139,7 +134,9 @@ def run_cells(faults: list[Planned], seed: int, until_s: float = float("inf")) -
         layout = left[0].layout
         waiting, went_on = len(left), ""
         try:
-            with working_cell(layout, seed=left[0].number) as bench:
+            # With it every approval away from home is refused for that reason, which would hide others: so it is in every second cell.
+            needs_home = left[0].number % 2 == 1
+            with working_cell(layout, seed=left[0].number, needs_home=needs_home) as bench:
                 went_on = begin(bench)
                 for _ in range(FAULTS_OF_A_CELL):
                     goes_on = went_on.startswith(("moves", "resumed")) and time.monotonic() < until_s
@@ -152,9 +149,7 @@ def run_cells(faults: list[Planned], seed: int, until_s: float = float("inf")) -
                         line.went_on = went_on = inject(bench, planned.fault, planned.moment_s)
                     except (TimeoutError, AssertionError) as error:
                         line.hung = went_on = str(error) or type(error).__name__
-                    # What is on its way comes.
-                    bench.operator.spin(LAST_MESSAGES_S)
-                    bench.settle()
+                    bench.catch_up()
                     found = bench.monitor.violations[known:]
                     line.violations = [(violation.kind.value, violation.text) for violation in found][:5]
                     if found:
@@ -301,7 +296,7 @@ def planted_campaign(only: str | None = None) -> dict[str, Violation | None]:
                 inject(bench, fault, moment_s)
             except (TimeoutError, AssertionError) as error:
                 print(f"{planted}: the run hangs: {error}", file=sys.stderr, flush=True)
-            bench.settle()
+            bench.catch_up()
             found = bench.monitor.violations
             first = next((violation for violation in found if violation.kind == expected), None)
             caught[planted] = first

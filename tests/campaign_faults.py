@@ -7,8 +7,25 @@ import signal
 import time
 from collections.abc import Callable
 
-from campaign_cell import UNDECIDED_S, Bench, Layout, begin, propose, propose_home
-from sctn_msgs.msg import PickPlace, StepConfirmation
+from campaign_cell import (
+    ATTEMPTS,
+    CONTROLLER,
+    UNDECIDED_S,
+    Bench,
+    Layout,
+    begin,
+    begin_from_home,
+    begin_with_disk,
+    carried_out,
+    count_step,
+    end_of_step,
+    has_ended,
+    hold_disk,
+    is_unheard,
+    propose,
+    propose_home,
+)
+from sctn_msgs.msg import PickPlace, StepConfirmation, StepResult
 
 # A stop reaches the executor, its cancel the driver, and the arm brakes, which takes 0.12 s.
 REST_S = 0.3
@@ -20,10 +37,16 @@ REST_WITH_LOSS_S = 1.0
 FROZEN_S = 1.5
 # Share of the datagrams that a bad network loses.
 LOSS = 0.2
-# A second executor has found out by then that there is one.
-LISTENING_S = 2.0
+# A second executor has found out by then that there is one, or has become active, also on a machine that does much else.
+LISTENING_S = 60.0
 # Suction is on within this time of a motion's beginning, or not any more.
 SUCTION_S = 8.0
+# servo_delay_s [s], vacuum_leak_s [s] and tool_voltage [V] with config/hardware/realistic.yaml.
+USUAL_DELAY_S, USUAL_LEAK_S, USUAL_TOOL_V = 0.03, 60.0, 24
+# An arm that is no further from home arrives there in a moment [rad].
+NEAR_HOME_RAD = 0.2
+# A process that was killed, or told to end, has ended by then.
+EXIT_S = 10.0
 # A recorder cannot write more to one file [blocks of 512 bytes].
 DISK_BLOCKS = 400
 # observation_max_age_s of config/hardware/realistic.yaml, and some more [s].
@@ -50,6 +73,25 @@ def kill_executor(bench: Bench) -> None:
 def terminate_executor(bench: Bench) -> None:
     bench.stopped(REST_S)
     bench.executor.signal(signal.SIGTERM)
+
+
+def killed(name: str, number: signal.Signals) -> Fault:
+    """Ends the watchdog or the driver."""
+
+    def inject(bench: Bench) -> None:
+        process = bench.watchdog if name == "watchdog" else bench.driver
+        if name == "driver":
+            # The simulated arm is gone with it: what counts is that nothing moves when another driver is there.
+            bench.stopped(REST_S)
+        process.signal(number)
+        process.wait(EXIT_S)
+        if name == "watchdog":
+            # The arm goes on, and can be stopped.
+            bench.operator.spin(0.3)
+            stop(bench)
+
+    inject.__name__ = f"{'kill' if number is signal.SIGKILL else 'terminate'}_{name}"
+    return inject
 
 
 def freeze_executor(bench: Bench) -> None:
@@ -111,13 +153,152 @@ def superseded_approval(bench: Bench) -> None:
 
 
 def another_executor(bench: Bench) -> None:
-    """A second executor in mid-motion, then a stop and an approval of the old proposal: neither moves the arm."""
+    """A second executor, then a stop and an approval of the old proposal: neither moves the arm.
+
+    It counts only once the second one has ended or hears confirmations: on a busy machine it may take longer to start than everything else.
+    """
+    before = bench.confirmation_readers()
     second = bench.start_executor()
     end = time.monotonic() + LISTENING_S
-    while second.exit_code is None and time.monotonic() < end:
+    while second.exit_code is None and not bench.confirmation_readers() - before and time.monotonic() < end:
         bench.operator.spin(0.05)
+    if second.exit_code is None:
+        assert bench.confirmation_readers() - before, f"the second executor has neither ended nor become active: {second.log()}"
+        # Both have to hear what is approved from now on.
+        bench.operator.listeners += 1
     stop(bench)
     bench.operator.confirm(bench.proposal.id, StepConfirmation.APPROVE)
+
+
+def approval_of_another(bench: Bench) -> None:
+    """After a stop somebody who does not decide approves the proposal that is offered."""
+    stop(bench)
+    bench.operator.spin(0.6)
+    proposal = propose(bench)
+    bench.operator.spin(0.2)
+    bench.operator.confirm(proposal.id, StepConfirmation.APPROVE, "eve")
+
+
+def controllers_inactive(bench: Bench) -> None:
+    """Somebody deactivates the controller that follows trajectories."""
+    bench.set_hardware("inactive_controllers", [CONTROLLER], [])
+    bench.stopped(REST_S)
+
+
+def speed_changes(bench: Bench) -> None:
+    """Somebody moves the speed slider in mid-motion; then the arm is stopped."""
+    for scaling in (0.3, 0.8, 0.1):
+        bench.set_hardware("speed_scaling", scaling, 1.0)
+        bench.operator.spin(0.4)
+    stop(bench)
+
+
+def path_tolerance(bench: Bench) -> None:
+    """After a stop the arm lags so far behind that the driver aborts the next motion."""
+    stop(bench)
+    bench.operator.spin(0.6)
+    bench.set_hardware("servo_delay_s", 0.5, USUAL_DELAY_S)
+
+    # Home slowly, which it can follow.
+    went_on = begin_from_home(bench)
+    for _ in range(ATTEMPTS):
+        if went_on.startswith("moves"):
+            went_on = end_of_step(bench).reason
+        if not is_unheard(bench, went_on):
+            break
+        went_on = begin_from_home(bench)
+    assert "path tolerance" in went_on, went_on
+
+
+def vacuum_leaks(bench: Bench) -> None:
+    """What is held falls in mid-air: nobody has decided that, and the motion ends as it was approved."""
+
+    def attempt(bench: Bench) -> StepResult:
+        bench.set_hardware("vacuum_leak_s", USUAL_LEAK_S, USUAL_LEAK_S)
+        hold_disk(bench)
+        bench.set_hardware("vacuum_leak_s", 0.1, USUAL_LEAK_S)
+        return end_of_step(bench)
+
+    stop(bench)
+    end = carried_out(bench, attempt)
+    assert end.outcome == StepResult.DROPPED, end
+
+
+def tool_voltage_off(bench: Bench) -> None:
+    """The tool has no power any more while something is held: it falls, and nothing begins to move before the power is back."""
+    stop(bench)
+    hold_disk(bench)
+    bench.set_hardware("tool_voltage", 0, USUAL_TOOL_V)
+    end = end_of_step(bench)
+    assert end.outcome in (StepResult.DROPPED, StepResult.FAULT), end
+
+
+def advance_is_repeated(bench: Bench) -> None:
+    """A step is carried out, and the operator says three times that it has succeeded."""
+    completed(bench)
+    count_step(bench, times=3)
+
+
+def kill_executor_after_step(bench: Bench) -> None:
+    """The executor is killed when it has just said that a step is carried out."""
+    completed(bench)
+    bench.stopped(REST_AFTER_DEATH_S)
+    bench.executor.signal(signal.SIGKILL)
+    # It hears confirmations no more.
+    bench.operator.listeners -= 1
+    count_step(bench)
+    bench.operator.listeners += 1
+
+
+def freeze_oracle(bench: Bench) -> None:
+    """The goal oracle stands still while a step ends and is confirmed."""
+
+    def attempt(bench: Bench) -> StepResult:
+        begin_with_disk(bench)
+        bench.oracle.signal(signal.SIGSTOP)
+        end = end_of_step(bench)
+        if end.outcome != StepResult.PLACED:
+            bench.oracle.signal(signal.SIGCONT)
+        return end
+
+    completed(bench, attempt)
+    bench.operator.confirm(bench.proposal.id, StepConfirmation.ADVANCE)
+    bench.operator.spin(FROZEN_S)
+    bench.oracle.signal(signal.SIGCONT)
+    count_step(bench)
+
+
+def step_with_loss(bench: Bench) -> None:
+    """A step ends and is confirmed while a fifth of all datagrams is lost. For longer the watchdog would not hear the executor in time."""
+
+    def attempt(bench: Bench) -> StepResult:
+        bench.link.lose(0.0)
+        hold_disk(bench)
+        bench.operator.until(lambda: not bench.vacuum or has_ended(bench), "release", 30.0)
+        bench.operator.until(lambda: is_near_home(bench) or has_ended(bench), "way home", 30.0)
+        bench.link.lose(LOSS)
+        return end_of_step(bench)
+
+    completed(bench, attempt)
+    count_step(bench)
+
+
+def is_near_home(bench: Bench) -> bool:
+    """Whether the arm is almost where it was brought last when it was sent home."""
+    return max(abs(a - b) for a, b in zip(bench.positions(), bench.home_rad, strict=True)) < NEAR_HOME_RAD
+
+
+def whole_step(bench: Bench) -> StepResult:
+    """How the step of a disk ends."""
+    begin_with_disk(bench)
+    return end_of_step(bench)
+
+
+def completed(bench: Bench, attempt: Callable[[Bench], StepResult] = whole_step) -> None:
+    """A whole step is carried out."""
+    stop(bench)
+    end = carried_out(bench, attempt)
+    assert end.outcome == StepResult.PLACED, end
 
 
 def stop_while_suction_is_on(bench: Bench) -> None:
@@ -239,6 +420,10 @@ FAULTS = [
     stop_naming_no_proposal,
     kill_executor,
     terminate_executor,
+    killed("watchdog", signal.SIGKILL),
+    killed("watchdog", signal.SIGTERM),
+    killed("driver", signal.SIGKILL),
+    killed("driver", signal.SIGTERM),
     freeze_executor,
     freeze_driver,
     freeze_watchdog,
@@ -246,9 +431,15 @@ FAULTS = [
     robot("emergency_stop"),
     robot("program_stopped"),
     robot("driver_dead"),
+    controllers_inactive,
+    speed_changes,
+    path_tolerance,
+    vacuum_leaks,
+    tool_voltage_off,
     spoofed_approvals,
     spoofed_proposals,
     superseded_approval,
+    approval_of_another,
     stale_messages,
     stale_view,
     another_executor,
@@ -259,6 +450,10 @@ FAULTS = [
     partition,
     stop_with_loss,
     whole_step_with_loss,
+    advance_is_repeated,
+    kill_executor_after_step,
+    freeze_oracle,
+    step_with_loss,
 ]
 
 # Faults that need another cell than the usual one.
@@ -267,4 +462,5 @@ LAYOUTS = {
     partition: Layout.TWO_HOSTS,
     stop_with_loss: Layout.TWO_HOSTS,
     whole_step_with_loss: Layout.TWO_HOSTS,
+    step_with_loss: Layout.TWO_HOSTS,
 }

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any, TypeVar
 
 import rclpy
@@ -29,6 +29,9 @@ EVENT = QoSProfile(
 )
 STREAM = QoSProfile(depth=5, history=HistoryPolicy.KEEP_LAST, reliability=ReliabilityPolicy.BEST_EFFORT)
 
+# Who decides.
+NAME = "end-to-end test"
+
 TOPICS = {
     "heightmap": (Heightmap, LATCHED),
     "goal": (Goal, LATCHED),
@@ -45,7 +48,8 @@ Message = TypeVar("Message")
 class Operator:
     """Subscribes to all topics of a run on one domain; a context manager."""
 
-    def __init__(self, domain: int, name: str = "operator") -> None:
+    def __init__(self, domain: int, name: str = "operator", topics: Iterable[str] = TOPICS) -> None:
+        """Keeps all messages of these topics."""
         # How many nodes have to hear a confirmation; more where the whole graph runs.
         self.listeners = 1
         # Is called with each confirmation before it is sent.
@@ -58,7 +62,8 @@ class Operator:
         self.node = rclpy.create_node(name, context=self._context)
         self._executor = SingleThreadedExecutor(context=self._context)
         self._executor.add_node(self.node)
-        for topic, (message_type, qos) in TOPICS.items():
+        for topic in topics:
+            message_type, qos = TOPICS[topic]
             self.node.create_subscription(message_type, topic, self.received[topic].append, qos)
         self.node.create_subscription(
             DiagnosticArray, "/diagnostics", lambda said: self.states.update({one.name: one for one in said.status}), EVENT
@@ -116,10 +121,10 @@ class Operator:
         driver = self.states.get("/suction_executor: driver")
         return driver is not None and driver.message == "ready"
 
-    def confirm(self, proposal_id: int, decision: int) -> None:
+    def confirm(self, proposal_id: int, decision: int, name: str = NAME) -> None:
         """Says one word on a proposal."""
         self._confirm_when_heard()
-        message = StepConfirmation(proposal_id=proposal_id, decision=decision, operator_name="end-to-end test")
+        message = StepConfirmation(proposal_id=proposal_id, decision=decision, operator_name=name)
         if self.received["clock"]:
             message.header.stamp = self.newest("clock").clock
         self.before_confirmation(message)

@@ -22,6 +22,7 @@ ROUTES = {
     "decisions": {"proposal_id": "1", "decision": "approve"},
     "proposals": {"pick": {"x_m": 0.5, "y_m": 0.0, "yaw_rad": 0.0}, "place": {"x_m": 0.4, "y_m": 0.1, "yaw_rad": 0.0}},
     "home": {},
+    "put_down": {},
     "step": {"step": 1},
     "lesson/begin": {},
     "lesson/show": {

@@ -105,6 +105,7 @@ class PickPlace(IdlStruct, typename="sctn_msgs::msg::dds_::PickPlace_"):
     success_probability: float32
     checkpoint: str
     author: str
+    done_probability: float32
 
 
 @dataclass

@@ -13,6 +13,8 @@ MOVING_RAD = 5e-4
 OVERTAKING_S = 0.05
 # What stands where it is to be placed may be released so long after a stop: that was asked for before the stop.
 RELEASE_S = 0.4
+# Where readings of the suction output are missing for longer than this before a stop, nobody knows on which side of it a change was.
+BLIND_S = 0.2
 # An arm that has not moved for so long has come to rest: what comes then is another motion.
 REST_TIME_S = 0.2
 # Status of a goal in action_msgs/GoalStatus: accepted, executing and cancelling ones move the arm.
@@ -42,6 +44,8 @@ class Kind(enum.Enum):
     DROPPED = "dropped_parts"
     # A goal takes the place of one under way: two executors, or one that does not wait.
     TWO_GOALS = "replaced_goals"
+    # A step that was carried out and confirmed leads to no next goal, or to more than one.
+    LOST = "lost_steps"
 
 
 @dataclasses.dataclass
@@ -82,6 +86,8 @@ class Monitor:
     # Where the arm was when it last was allowed to move: nothing where it is not any more, and its motion is measured from there.
     _allowed_at: list[float] | None = None
     _suction: bool = False
+    # When the suction output was read last.
+    _suction_read_at: float = 0.0
     # Whether a descent has ended at contact since suction was switched on.
     _is_placed: bool = False
     # Proposals whose approval must not move the arm, and why.
@@ -94,6 +100,13 @@ class Monitor:
     # When a goal that was on its way was accepted after the stop, and where the arm was.
     _late_goal_at: float | None = None
     _late_from: list[float] | None = None
+    # Proposals that the executor says it has placed, and those that the deciding operator says succeeded.
+    _placed: set[int] = dataclasses.field(default_factory=set)
+    _confirmed: set[int] = dataclasses.field(default_factory=set)
+    # Both, in the order in which they became so, until the goal oracle counts them.
+    _to_count: list[int] = dataclasses.field(default_factory=list)
+    # The step of the present goal.
+    _step: int | None = None
     # What was heard, and when.
     _history: collections.deque[tuple[float, str]] = dataclasses.field(default_factory=lambda: collections.deque(maxlen=HISTORY_LENGTH))
 
@@ -150,12 +163,14 @@ class Monitor:
     def on_suction(self, on: bool, now: float) -> None:
         """A reading of the output that switches suction: a stop leaves it as it is."""
         was_on, self._suction = self._suction, on
+        before, self._suction_read_at = self._suction_read_at, now
         if on != was_on:
             self._hear(f"suction {'on' if on else 'off'}", now)
         if on and not was_on:
             self._is_placed = False
+        is_after = self._stopped_at is not None and self._stopped_at <= now and self._stopped_at - before <= BLIND_S
         released = self._is_placed and self._stopped_at is not None and now - self._stopped_at <= RELEASE_S
-        if was_on and not on and self._stopped_at is not None and not released:
+        if was_on and not on and is_after and not released:
             text = f"suction is switched off {now - self._stopped_at:.2f} s after a stop: what is held is dropped"
             self._violate(Kind.DROPPED, text, now)
 
@@ -191,6 +206,47 @@ class Monitor:
         none_is_under_way = not any(status in UNDER_WAY for goals in self._goals.values() for status in goals.values())
         if self._stopped_at is not None and self._late_goal_at is None and now - self._stopped_at <= self._limit_s:
             self._may_be_unanswered |= none_is_under_way
+
+    def on_placed(self, proposal_id: int, now: float) -> None:
+        """The executor says that it has placed something."""
+        self._hear(f"placed {proposal_id}", now)
+        self._placed.add(proposal_id)
+        self._complete(proposal_id)
+
+    def on_advance(self, proposal_id: int, operator: str, now: float) -> None:
+        """Somebody says that a step has succeeded; said twice it counts once."""
+        self._hear(f"{operator} says that {proposal_id} succeeded", now)
+        if operator == self.deciding_operator and proposal_id not in self._confirmed:
+            self._confirmed.add(proposal_id)
+            self._complete(proposal_id)
+
+    def _complete(self, proposal_id: int) -> None:
+        if proposal_id in self._placed & self._confirmed and proposal_id not in self._to_count:
+            self._to_count.append(proposal_id)
+
+    def on_goal(self, step: int, now: float) -> None:
+        """The goal oracle has published a goal. One of an earlier step, or of the same one, was asked for: it counts nothing."""
+        before, self._step = self._step, step
+        if before is None or step <= before:
+            return
+        self._hear(f"goal: step {step}", now)
+        counted = step - before
+        if counted > len(self._to_count):
+            text = f"the goal goes from step {before} to step {step}, and {len(self._to_count)} completed steps were to be counted"
+            self._violate(Kind.LOST, text, now)
+        del self._to_count[:counted]
+
+    def on_counting_ends(self, now: float) -> None:
+        """By now every completed step has to be counted."""
+        for proposal_id in self._to_count:
+            self._violate(Kind.LOST, f"the step of proposal {proposal_id} was placed and confirmed, and is not counted", now)
+        self._to_count.clear()
+
+    def on_new_driver(self) -> None:
+        """Another process is the driver: it knows no goal, and its outputs are off."""
+        self.on_lost_sight()
+        self._goals.clear()
+        self._suction = self._is_placed = False
 
     def on_lost_sight(self) -> None:
         """The driver says nothing any more: where the arm has come to rest meanwhile is not known before the next reading."""

@@ -5,10 +5,12 @@ from __future__ import annotations
 import fcntl
 import os
 import pathlib
+import pty
 import signal
 import socket
 import subprocess
 import tempfile
+import termios
 import time
 from typing import IO
 
@@ -84,7 +86,7 @@ class Process:
         prefix: list[str] | None = None,
         typed: bool = False,
     ) -> None:
-        """With a prefix the executable is started by another program, which has to become it. Typed: it reads what `type` is given."""
+        """With a prefix the executable is started by another program, which has to become it. Typed: at a pseudo terminal, by `type`."""
         self.name = name
         executable = BINARIES / name
         if not executable.exists():
@@ -92,17 +94,23 @@ class Process:
         number = len(list(log_directory.glob(f"{name}-*.out")))
         self._output_file = log_directory / f"{name}-{number}.out"
         self._error_file = log_directory / f"{name}-{number}.err"
+        # A person's end of the terminal, and the executable's.
+        self._terminal, its_terminal = pty.openpty() if typed else (None, subprocess.DEVNULL)
         with self._output_file.open("wb") as output, self._error_file.open("wb") as errors:
             # Its own session: whatever it starts can be found and ended with it.
             self._child = subprocess.Popen(
                 [*(prefix or []), executable, *map(str, arguments)],
                 cwd=REPOSITORY,
                 env={**environment(domain), **(variables or {})},
-                stdin=subprocess.PIPE if typed else subprocess.DEVNULL,
+                stdin=its_terminal,
                 stdout=output,
                 stderr=errors,
                 start_new_session=True,
+                # The terminal of its session: who closes it hangs up on the executable.
+                preexec_fn=(lambda: fcntl.ioctl(0, termios.TIOCSCTTY, 0)) if typed else None,
             )
+        if typed:
+            os.close(its_terminal)
 
     @property
     def pid(self) -> int:
@@ -118,12 +126,13 @@ class Process:
 
     def type(self, line: str) -> None:
         """Types a line at its terminal."""
-        self._child.stdin.write(f"{line}\n".encode())
-        self._child.stdin.flush()
+        os.write(self._terminal, f"{line}\n".encode())
 
     def close_terminal(self) -> None:
-        """Closes its standard input."""
-        self._child.stdin.close()
+        """Closes the terminal, as a person who closes its window."""
+        if self._terminal is not None:
+            os.close(self._terminal)
+            self._terminal = None
 
     def output(self) -> str:
         """Standard output so far."""
@@ -172,3 +181,4 @@ class Process:
             except ProcessLookupError:
                 pass
         self._child.wait(GRACE_S)
+        self.close_terminal()

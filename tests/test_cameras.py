@@ -14,6 +14,7 @@ from cameras import (
     CAMERA_HEIGHT_M,
     FOCAL_PX,
     HEIGHT,
+    LENSES,
     WIDTH,
     Cameras,
     Change,
@@ -21,6 +22,7 @@ from cameras import (
     depth_pixels,
     image,
     set_depth,
+    through_lens,
 )
 from cell_operator import LATCHED, Operator, nanoseconds
 from diagnostic_msgs.msg import DiagnosticStatus
@@ -141,28 +143,15 @@ def test_depth_of_the_other_byte_order_with_padded_rows_gives_the_same_heights(c
     assert np.abs(heights(heightmap)[155:165, 75:85] - BOX_HEIGHT_M).max() < TOLERANCE_M
 
 
-LENS = (0.3, -0.1, 0.004, -0.003, 0.02)
-
-
-def through_lens(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Where plumb_bob shows ideal points, as OpenCV documents it."""
-    k1, k2, p1, p2, k3 = LENS
-    square = x * x + y * y
-    radial = 1 + k1 * square + k2 * square**2 + k3 * square**3
-    return (
-        x * radial + 2 * p1 * x * y + p2 * (square + 2 * x * x),
-        y * radial + p1 * (square + 2 * y * y) + 2 * p2 * x * y,
-    )
-
-
-def test_a_camera_behind_a_lens_sees_the_box_where_the_others_do(cameras, operator_for_module) -> None:
+@pytest.mark.parametrize("model", LENSES)
+def test_a_camera_behind_a_lens_sees_the_box_where_the_others_do(cameras, operator_for_module, model: str) -> None:
     rows, columns = np.mgrid[0:HEIGHT, 0:WIDTH]
     seen_x, seen_y = (columns - (WIDTH - 1) / 2) / FOCAL_PX, (rows - (HEIGHT - 1) / 2) / FOCAL_PX
     # The box in a corner of the image, where the lens moves it by a dozen cells.
     inside = lambda x, y: (np.abs(x - 0.4) < 0.05) & (np.abs(y - 0.18) < 0.05)  # noqa: E731
     ideal_x, ideal_y = seen_x.copy(), seen_y.copy()
-    for _ in range(100):
-        shown_x, shown_y = through_lens(ideal_x, ideal_y)
+    for _ in range(300):
+        shown_x, shown_y = through_lens(model, ideal_x, ideal_y)
         ideal_x, ideal_y = ideal_x + seen_x - shown_x, ideal_y + seen_y - shown_y
     assert max(np.abs(shown_x - seen_x).max(), np.abs(shown_y - seen_y).max()) < 1e-9
 
@@ -173,7 +162,8 @@ def test_a_camera_behind_a_lens_sees_the_box_where_the_others_do(cameras, operat
         set_depth(view, depth)
         view.colour = image(view.colour.header, "rgb8", 3 * WIDTH, colour)
         if lens:
-            view.info.d = list(LENS)
+            view.info.distortion_model = model
+            view.info.d = list(LENSES[model])
 
     straight = heights(fused(operator_for_module, cameras, lambda view: show(view, False), None))
     bent = heights(fused(operator_for_module, cameras, lambda view: show(view, view.info.header.frame_id.startswith("left")), None))
@@ -215,8 +205,19 @@ def intrinsics_that_are_no_number(view: View) -> None:
 
 
 def unknown_lens(view: View) -> None:
-    view.info.distortion_model = "equidistant"
+    view.info.distortion_model = "omnidirectional"
     view.info.d = [0.1, 0.0, 0.0, 0.0]
+
+
+def coefficient_that_is_no_number(view: View) -> None:
+    view.info.distortion_model = "equidistant"
+    view.info.d = [0.1, 0.0, math.nan, 0.0]
+
+
+def fisheye_that_sees_behind_itself(view: View) -> None:
+    view.info.distortion_model = "equidistant"
+    view.info.d = [0.0] * 4
+    view.info.k[0] = view.info.k[4] = FOCAL_PX / 2
 
 
 def lens_that_folds_the_image(view: View) -> None:
@@ -238,7 +239,9 @@ def unknown_frame(view: View) -> None:
         (colour_of_other_size, ["left/color"]),
         (no_focal_length, ["left/color/camera_info"]),
         (intrinsics_that_are_no_number, ["left/color/camera_info"]),
-        (unknown_lens, ["left/color/camera_info", "equidistant", "plumb_bob"]),
+        (unknown_lens, ["left/color/camera_info", "omnidirectional", "plumb_bob"]),
+        (coefficient_that_is_no_number, ["left/color/camera_info", "d[2]"]),
+        (fisheye_that_sees_behind_itself, ["left/color/camera_info", "equidistant", "pixel"]),
         (lens_that_folds_the_image, ["left/color/camera_info", "distortion", "pixel"]),
         (unknown_frame, ["nowhere"]),
     ],
@@ -382,6 +385,45 @@ def test_a_calibration_file_says_where_the_cameras_are_without_tf(start, tmp_pat
         assert refused.wait(60.0) != 0
         assert "cell.yaml" in refused.errors()
         assert word in refused.errors()
+
+
+@pytest.mark.parametrize(
+    ("preset", "topics"),
+    [
+        (
+            "realsense_aligned",
+            ["color/image_raw", "aligned_depth_to_color/image_raw", "color/camera_info", "aligned_depth_to_color/camera_info"],
+        ),
+        ("orbbec", ["color/image_raw", "depth/image_raw", "color/camera_info", "depth/camera_info"]),
+        (
+            "zed",
+            [
+                "zed_node/rgb/color/rect/image",
+                "zed_node/depth/depth_registered",
+                "zed_node/rgb/color/rect/camera_info",
+                "zed_node/depth/camera_info",
+            ],
+        ),
+        (
+            "zed_5_0",
+            ["zed_node/rgb/image_rect_color", "zed_node/depth/depth_registered", "zed_node/rgb/camera_info", "zed_node/depth/camera_info"],
+        ),
+    ],
+)
+def test_the_topics_of_a_real_driver_are_heard_by_its_preset(start, preset: str, topics: list[str]) -> None:
+    other = free_domain()
+    start("camera_fusion", "--ros-args", "-p", f"camera_preset:={preset}", domain=other)
+    with Operator(other) as operator:
+        cameras = Cameras(operator, topics=tuple(topics))
+        cameras.wait_for_fusion()
+        cameras.publish_extrinsics()
+        assert fused(operator, cameras).views == 3
+
+
+def test_an_unknown_preset_is_refused_by_name(start) -> None:
+    refused = start("camera_fusion", "--ros-args", "-p", "camera_preset:=kinect", domain=free_domain())
+    assert refused.wait(60.0) != 0
+    assert "camera_preset" in refused.errors() and "realsense_aligned" in refused.errors()
 
 
 def test_every_view_of_the_heightmap_comes_to_who_listens(start) -> None:

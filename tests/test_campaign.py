@@ -133,6 +133,25 @@ def test_the_monitor_catches_a_part_that_a_stop_drops(monitor: Monitor) -> None:
     assert "suction is switched off 0.50 s after a stop" in str(monitor.violations[0])
 
 
+def test_suction_that_may_have_been_switched_off_before_a_stop_drops_nothing(monitor: Monitor) -> None:
+    monitor.on_approval(2, "anna")
+    monitor.on_suction(True, 1.0)
+    monitor.on_stop(1.5, 0.3)
+    # Heard of late.
+    monitor.on_suction(False, 1.4)
+    monitor.on_suction(True, 2.0)
+    # Nothing was heard from before another stop until after it.
+    monitor.on_stop(3.0, 0.3, again=True)
+    monitor.on_suction(False, 4.0)
+    assert not monitor.violations
+    # One reading after the stop is enough.
+    monitor.on_suction(True, 5.0)
+    monitor.on_stop(5.0, 0.3, again=True)
+    monitor.on_suction(True, 5.1)
+    monitor.on_suction(False, 6.0)
+    assert [found.kind for found in monitor.violations] == [Kind.DROPPED]
+
+
 def test_a_part_that_stands_at_its_place_may_be_released_as_a_stop_comes_and_no_other(monitor: Monitor) -> None:
     monitor.on_approval(2, "anna")
     monitor.on_goals("until", {b"pick": 4}, 1.0, answers_late=True)
@@ -169,6 +188,32 @@ def test_the_monitor_catches_a_way_home_that_nobody_has_approved(monitor: Monito
     monitor.on_approval(3, "anna")
     move(monitor, 3.0)
     assert monitor.violations
+
+
+def test_the_monitor_catches_a_completed_step_that_is_not_counted_or_counted_twice(monitor: Monitor) -> None:
+    monitor.on_goal(1, 0.0)
+    monitor.on_placed(2, 1.0)
+    # Nobody who decides has said that it succeeded.
+    monitor.on_advance(2, "eve", 1.1)
+    monitor.on_counting_ends(2.0)
+    assert not monitor.violations
+    # Said before its result, and twice, it counts once.
+    monitor.on_advance(3, "anna", 2.9)
+    monitor.on_placed(3, 3.0)
+    monitor.on_advance(3, "anna", 3.1)
+    monitor.on_goal(2, 3.2)
+    monitor.on_counting_ends(4.0)
+    assert not monitor.violations
+    monitor.on_goal(3, 4.1)
+    assert [found.kind for found in monitor.violations] == [Kind.LOST]
+    assert "goes from step 2 to step 3, and 0 completed steps" in str(monitor.violations.pop())
+    # The operator goes back to the first step.
+    monitor.on_goal(1, 5.0)
+    monitor.on_placed(4, 6.0)
+    monitor.on_advance(4, "anna", 6.1)
+    monitor.on_goal(1, 6.2)
+    monitor.on_counting_ends(7.0)
+    assert [str(found) for found in monitor.violations] == ["the step of proposal 4 was placed and confirmed, and is not counted"]
 
 
 def test_the_executor_that_is_shipped_has_no_planted_faults() -> None:

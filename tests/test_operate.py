@@ -2,14 +2,21 @@
 
 from __future__ import annotations
 
+import copy
+
 import numpy as np
 import pytest
 from campaign_cell import arguments
-from cell_operator import Operator
+from cell_operator import STREAM, Operator
 from processes import Process
+from rcl_interfaces.srv import SetParameters
+from rclpy.action import ActionClient
+from rclpy.parameter import Parameter
+from sctn_msgs.action import ExecutePickPlace
 from sctn_msgs.msg import PickPlace, StepConfirmation, StepResult
-from test_hardware import look_at, propose, wait_until_moving
+from test_hardware import DISK, VACUUM_PIN, look_at, look_at_disk, propose, wait_until_moving
 from test_refusals import Cell
+from ur_msgs.msg import IOStates
 
 
 class Terminal:
@@ -74,6 +81,8 @@ def test_a_person_at_the_terminal_rejects_approves_stops_and_calls_the_arm_home(
     terminal.shows("carry it out?")
     terminal.says("y")
     terminal.shows("at home")
+    # The next view is from after that.
+    terminal.cell.operator.spin(0.5)
     # A step that was carried out is asked about, without a reward.
     proposal = terminal.offered()
     terminal.says("y")
@@ -88,6 +97,80 @@ def test_a_person_at_the_terminal_rejects_approves_stops_and_calls_the_arm_home(
     terminal.shows("did the step succeed?")
     terminal.says("n")
     operator.until(lambda: decided and decided[-1].decision == StepConfirmation.RETRY, "RETRY", 30.0)
+    assert {said.operator_name for said in decided} == {"anna"}
+
+
+def test_a_goal_of_the_action_is_offered_at_the_terminal(terminal: Terminal) -> None:
+    operator = terminal.cell.operator
+    execute = ActionClient(operator.node, ExecutePickPlace, "execute_pick_place")
+    operator.until(execute.server_is_ready, "action", 30.0)
+    operator.until(lambda: operator.node.get_subscriptions_info_by_topic("/pick_place_goal"), "terminal that hears goals", 30.0)
+    proposal = propose(terminal.cell)
+    terminal.shows("carry it out?")
+    goal = copy.deepcopy(proposal)
+    goal.id = proposal.id + 1000
+    sending = execute.send_goal_async(ExecutePickPlace.Goal(proposal=goal))
+    operator.until(sending.done, "answer to the goal", 30.0)
+    assert sending.result().accepted
+    terminal.shows("carry it out?")
+    after = operator.count("step_result")
+    terminal.says("n")
+    assert ended(terminal, after, goal.id).outcome == StepResult.REJECTED
+
+
+def test_after_a_fault_a_person_puts_down_what_is_held_and_has_the_step_tried_again(terminal: Terminal) -> None:
+    cell, operator = terminal.cell, terminal.cell.operator
+    decided: list[StepConfirmation] = []
+    operator.node.create_subscription(StepConfirmation, "step_confirmation", decided.append, 10)
+    pins: list[IOStates] = []
+    operator.node.create_subscription(IOStates, "io_and_status_controller/io_states", pins.append, STREAM)
+    client = operator.node.create_client(SetParameters, "sim_workcell/set_parameters")
+    operator.until(client.service_is_ready, "sim_workcell", 30.0)
+
+    def holds() -> bool:
+        return bool(pins) and any(pin.pin == VACUUM_PIN and pin.state for pin in pins[-1].digital_in_states)
+
+    def robot_is(fault: str) -> None:
+        value = Parameter("hardware.fault", Parameter.Type.STRING, fault).to_parameter_msg()
+        answer = client.call_async(SetParameters.Request(parameters=[value]))
+        operator.until(answer.done, "answer of sim_workcell", 30.0)
+        assert answer.result().results[0].successful, answer.result()
+
+    def pick_the_disk(proposal: PickPlace) -> None:
+        proposal.pick = DISK
+
+    terminal.says("r")
+    terminal.shows("no step was broken off")
+    terminal.says("p")
+    terminal.shows("holds nothing")
+    after = operator.count("step_result")
+    proposal = cell.propose(cell.observe(look_at_disk(cell)), pick_the_disk)
+    terminal.shows("carry it out?")
+    terminal.says("y")
+    operator.until(holds, "vacuum", 30.0)
+    # Lifted, and on its way.
+    operator.spin(1.5)
+    robot_is("protective_stop")
+    fault = ended(terminal, after, proposal.id)
+    assert fault.outcome == StepResult.FAULT, fault
+    terminal.shows("the arm stands where it is")
+    robot_is("none")
+    operator.states.clear()
+    operator.until(operator.executor_is_ready, "executor that is ready again", 30.0)
+    assert holds()
+    after = operator.count("step_result")
+    terminal.says("p")
+    terminal.shows("what is held is put down where it was picked")
+    terminal.shows("carry it out?")
+    # Nothing moves before that.
+    assert holds()
+    terminal.says("y")
+    put_down = operator.next("step_result", after)
+    assert put_down.outcome == StepResult.AT_HOME and "put down where it was picked" in put_down.reason, put_down
+    assert not holds()
+    terminal.says("r")
+    operator.until(lambda: decided and decided[-1].decision == StepConfirmation.RETRY, "RETRY", 30.0)
+    assert decided[-1].proposal_id == proposal.id
     assert {said.operator_name for said in decided} == {"anna"}
 
 

@@ -24,9 +24,11 @@ import urllib.request
 from collections.abc import Callable, Iterator
 from typing import Any
 
+import numpy as np
 import pytest
 import teaching
 from browser import PATIENCE_MS, Person, address_of, chromium, launched, no_barrier
+from cameras import LENSES, through_lens
 from cell_operator import EVENT, Operator, nanoseconds
 from playwright.sync_api import Browser, Locator, expect
 from processes import REPOSITORY, Process
@@ -386,11 +388,13 @@ def test_a_run_is_corrected_stopped_continued_and_handed_over_by_keyboard_alone(
     assert round(1000 * corrected.place.x) == typed
     expect(ada.button("Approve")).to_be_focused()
     ada.can("Approve")
-    # Stopped in mid-motion.
+    # Stopped in mid-motion, with the part held.
+    expect(ada.button("Put the part down")).to_be_hidden()
     slow_down(operator, 1.0)
     results = operator.count("step_result")
     keyboard.press("a")
     ada.reads("the arm moves")
+    ada.sees("holds something")
     keyboard.press("s")
     ada.reads("stopped")
     assert operator.next("step_result", results).outcome == StepResult.STOPPED
@@ -400,8 +404,14 @@ def test_a_run_is_corrected_stopped_continued_and_handed_over_by_keyboard_alone(
     assert said[1][1] == StepConfirmation.STOP
     keyboard.press("h")
     ada.can("Go home this way")
+    # It would carry the part home: it is put down instead, where it was picked, and nothing moves before that is approved.
+    keyboard.press("d")
+    ada.can("Put it down this way")
+    ada.finds_no_barrier()
+    assert len(decided()) == len(said)
     keyboard.press("g")
-    ada.sees("The arm is at home.")
+    ada.sees("what was held is put down where it was picked")
+    expect(ada.button("Put the part down")).to_be_hidden()
     keyboard.press("c")
     ada.reads("proposes")
     ada.can("Approve")
@@ -943,3 +953,17 @@ def test_hostile_input_moves_nothing_and_the_page_works_on(start, decided) -> No
     console.wait("awaiting_confirmation")
     until(decided, "decision on the graph", 30.0)
     assert [one.decision for one in decided()] == [StepConfirmation.APPROVE]
+
+
+@pytest.mark.parametrize("model", LENSES)
+def test_the_page_draws_through_every_lens_as_it_is_documented(browser: Browser, model: str) -> None:
+    source = (REPOSITORY / "console/page/cameras.js").read_text()
+    through = re.search(r"^function throughLens.*?^}$", source, re.MULTILINE | re.DOTALL).group(0)
+    points = [[0.1, 0.2], [-0.4, 0.3], [0.6, -0.5], [0.01, 0.0]]
+    page = browser.new_page()
+    shown = page.evaluate(
+        f"([d, points]) => {{ {through}; return points.map(([x, y]) => throughLens('{model}', d, x, y)); }}", [LENSES[model], points]
+    )
+    page.close()
+    expected = through_lens(model, *np.array(points).T)
+    assert np.allclose(np.array(shown).T, expected, atol=1e-12)

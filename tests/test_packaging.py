@@ -2,23 +2,20 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import os
 import pathlib
 import re
 import subprocess
 import sys
-import types
 
 import pytest
 import yaml
 from catkin_pkg.packages import find_packages
+from launch_files import LAUNCH_FILES, PACKAGE, Launch, description, kind, parts, path_of
 from processes import BINARIES, REPOSITORY
 
-PACKAGE = REPOSITORY / "nodes"
 NODES = ["camera_fusion", "gctn_policy", "goal_oracle", "motion_watchdog", "operator_console", "sim_workcell", "suction_executor"]
-LAUNCH_FILES = sorted((PACKAGE / "launch").glob("*.launch.py"))
 
 
 def test_a_workspace_finds_both_packages_and_each_is_valid() -> None:
@@ -58,93 +55,106 @@ def test_the_package_installs_every_executable_parameter_and_launch_file(tmp_pat
     assert "no benchmark of that name" in shown.stderr, shown.stderr
 
 
-class Recorded:
-    """What a launch file asked for: a class of `launch` with its arguments."""
-
-    def __init__(self, *values: object, **named: object) -> None:
-        self.values, self.named = values, named
-
-    def __iter__(self):
-        yield from (*self.values, *self.named.values())
-
-
-def parts(value: object):
-    """Everything in a description."""
-    yield value
-    if isinstance(value, Recorded):
-        for part in value:
-            yield from parts(part)
-    elif isinstance(value, dict):
-        for part in value.values():
-            yield from parts(part)
-    elif isinstance(value, (list, tuple)):
-        for part in value:
-            yield from parts(part)
-
-
-@pytest.fixture
-def launch_modules(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Stands in for the packages launch and launch_ros, which cannot be had with pip."""
-    contents = {
-        "launch": ["LaunchDescription"],
-        "launch.actions": ["DeclareLaunchArgument"],
-        "launch.conditions": ["IfCondition"],
-        "launch.substitutions": ["Command", "LaunchConfiguration", "PathJoinSubstitution"],
-        "launch_ros": [],
-        "launch_ros.actions": ["Node"],
-        "launch_ros.parameter_descriptions": ["ParameterValue"],
-        "launch_ros.substitutions": ["FindPackageShare"],
-    }
-    for name, classes in contents.items():
-        module = types.ModuleType(name)
-        for item in classes:
-            setattr(module, item, type(item, (Recorded,), {}))
-        monkeypatch.setitem(sys.modules, name, module)
-
-
-def description(file: pathlib.Path) -> list[Recorded]:
-    specification = importlib.util.spec_from_file_location(file.name.split(".")[0], file)
-    module = importlib.util.module_from_spec(specification)
-    specification.loader.exec_module(module)
-    return module.generate_launch_description().values[0]
-
-
-def kind(value: object) -> str:
-    return type(value).__name__
-
-
-def shared_path(path: Recorded) -> pathlib.Path:
-    """A path below the share folder of the package, where the repository has it."""
-    share, *names = path.values[0]
-    assert share.values == ("sctn_nodes",)
-    return REPOSITORY.joinpath(*names)
-
-
 def parameters_of(node: str) -> dict:
     return yaml.safe_load((REPOSITORY / f"config/{node}.yaml").read_text())[f"/**/{node}"]["ros__parameters"]
 
 
 @pytest.mark.parametrize("file", LAUNCH_FILES, ids=lambda file: file.name)
-def test_what_a_launch_file_names_is_there(launch_modules, file: pathlib.Path) -> None:
+def test_what_a_launch_file_names_is_there(file: pathlib.Path) -> None:
     entities = description(file)
     declared = {entity.values[0] for entity in entities if kind(entity) == "DeclareLaunchArgument"}
     asked = {part.values[0] for part in parts(entities) if kind(part) == "LaunchConfiguration"}
     assert asked == declared
     for part in parts(entities):
         if kind(part) == "PathJoinSubstitution":
-            assert shared_path(part).exists(), shared_path(part)
+            assert path_of(part).exists(), path_of(part)
     ours = [entity.named for entity in entities if kind(entity) == "Node" and entity.named["package"] == "sctn_nodes"]
     names = {node["executable"] for node in ours}
     assert names == set(NODES) - (set() if "simulated" in file.name else {"sim_workcell"})
     for node in ours:
-        files, given = node["parameters"]
-        assert shared_path(files) == REPOSITORY / f"config/{node['executable']}.yaml"
+        (given,) = [part for part in node["parameters"] if isinstance(part, dict)]
+        assert path_of(node["parameters"][0]) == REPOSITORY / f"config/{node['executable']}.yaml"
         known = parameters_of(node["executable"])
         assert set(given) <= set(known), node["executable"]
         assert given["use_sim_time"] is ("simulated" in file.name)
     foreign = {entity.named["package"] for entity in entities if kind(entity) == "Node"} - {"sctn_nodes"}
     depends = re.findall(r"<exec_depend>(.*)</exec_depend>", (PACKAGE / "package.xml").read_text())
     assert foreign <= set(depends)
+
+
+REAL_CELL = PACKAGE / "launch/real_cell.launch.py"
+
+
+def test_on_a_real_cell_a_file_of_the_engineer_wins_and_a_stop_is_remembered() -> None:
+    launch = Launch(REAL_CELL, check="false")
+    entities = launch.entities
+    nodes = {entity.named["executable"]: entity.named for entity in entities if kind(entity) == "Node"}
+    for name in set(NODES) - {"sim_workcell"}:
+        _, real_cell, _, of_engineer = nodes[name]["parameters"]
+        assert path_of(real_cell) == REPOSITORY / "config/real_cell.yaml"
+        assert (kind(of_engineer), of_engineer.values) == ("LaunchConfiguration", ("parameters",))
+    given = nodes["suction_executor"]["parameters"][2]
+    asked = {name: value.values[0] for name, value in given.items() if kind(value) == "LaunchConfiguration"}
+    assert asked == {name: name for name in ("urdf", "arm_calibration", "stop_file")}
+    defaults = {entity.values[0]: entity.named["default_value"] for entity in entities if kind(entity) == "DeclareLaunchArgument"}
+    home, *path = defaults["stop_file"]
+    assert (kind(home), home.values) == ("EnvironmentVariable", ("ROS_HOME",))
+    # Two cells on one host, in two namespaces, have two files.
+    assert any(kind(part) == "LaunchConfiguration" and part.values == ("namespace",) for part in path)
+    # The file that is read where the engineer names none is one that is read before, too.
+    assert path_of(defaults["parameters"]) == REPOSITORY / "config/real_cell.yaml"
+
+
+def test_a_real_cell_has_a_median_and_the_topics_of_its_cameras_in_fusion_page_and_check() -> None:
+    launch = Launch(
+        REAL_CELL,
+        camera_preset="orbbec",
+        frames="7",
+        calibration="/cell/calibration.yaml",
+        arm_calibration="/cell/arm.yaml",
+        contact="vacuum",
+        namespace="cell",
+    )
+    given = {
+        node["executable"]: node["parameters"][2]
+        for node in (entity.named for entity in launch.entities if kind(entity) == "Node")
+        if "package" in node and node["package"] == "sctn_nodes"
+    }
+    assert launch.text(given["camera_fusion"]["frames"]) == "7"
+    assert int(Launch(REAL_CELL).arguments["frames"]) > 1
+    for node in ("camera_fusion", "operator_console"):
+        assert launch.text(given[node]["camera_preset"]) == "orbbec"
+    [check] = launch.processes()
+    assert check[:2] == [str(BINARIES / "sctn"), "check"]
+    for words in (
+        ["-p", "camera_fusion:frames:=7"],
+        ["-p", "camera_fusion:camera_preset:=orbbec"],
+        ["-p", 'camera_fusion:calibration:="/cell/calibration.yaml"'],
+        ["-p", "suction_executor:driver.contact:=vacuum"],
+        ["-p", 'suction_executor:arm_calibration:="/cell/arm.yaml"'],
+        ["-r", "__ns:=/cell"],
+    ):
+        at = check.index(words[1])
+        assert check[at - 1 : at + 1] == words
+
+
+def test_the_executor_of_a_real_cell_starts_only_when_the_check_has_found_nothing() -> None:
+    launch = Launch(REAL_CELL)
+    assert "suction_executor" not in launch.nodes()
+    started = launch.after(0)
+    assert [(kind(action), action.named["executable"]) for action in started] == [("Node", "suction_executor")]
+    # As it starts at once where nobody asks for the check.
+    unchecked = Launch(REAL_CELL, check="false")
+    assert "suction_executor" in unchecked.nodes()
+    assert unchecked.processes() == []
+    assert unchecked.after(0) == []
+    [at_once] = [entity for entity in unchecked.entities if kind(entity) == "Node" and entity.named["executable"] == "suction_executor"]
+    assert launch.text(started[0].named["parameters"][0]) == unchecked.text(at_once.named["parameters"][0])
+    assert set(started[0].named["parameters"][2]) == set(at_once.named["parameters"][2])
+    for returncode in (1, 2, 101, -9):
+        [said] = launch.after(returncode)
+        assert kind(said) == "LogInfo"
+        assert "sctn check" in said.named["msg"]
 
 
 def interface_page() -> str:

@@ -14,7 +14,10 @@ import pytest
 from builtin_interfaces.msg import Time
 from cell_operator import LATCHED, Operator, nanoseconds
 from geometry_msgs.msg import Point, Pose2D
+from processes import free_domain
+from rcl_interfaces.srv import SetParameters
 from rclpy.duration import Duration
+from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
 from sctn_msgs.msg import Heightmap, PickPlace, PrimitiveSettings, StepConfirmation, StepResult
 from std_msgs.msg import Header
@@ -75,6 +78,10 @@ class Cell:
         """Publishes a heightmap, maybe once more."""
         self.newest_heightmap = heightmap
         self._publish(self._heightmaps, heightmap)
+
+    def stop_publishing_heightmaps(self) -> None:
+        """The camera fusion has gone."""
+        self.operator.node.destroy_publisher(self._heightmaps)
 
     def propose(self, heightmap: Heightmap, change: Callable[[PickPlace], None] = lambda _: None) -> PickPlace:
         """Publishes a proposal that is good unless changed."""
@@ -240,6 +247,18 @@ def test_an_approval_after_the_observation_changed_moves_nothing(cell: Cell) -> 
     refused(cell, cell.decide(proposal.id), "changed")
 
 
+def test_a_way_through_something_moves_nothing(cell: Cell) -> None:
+    def wall(heightmap: Heightmap) -> None:
+        """0.3 m high and 19 mm thick, across the table between pick and place."""
+        heights_m = np.zeros((ROWS, COLS), dtype=np.float32)
+        heights_m[157:163] = 0.3
+        heightmap.height_m = heights_m.ravel()
+        # Simulated time stands still: a view of its own all the same.
+        heightmap.header.stamp.nanosec += 1_000
+
+    refused(cell, cell.decide(cell.propose(cell.observe(wall)).id), "the heightmap at (", "expected 0.01")
+
+
 def test_a_proposal_from_a_heightmap_that_nobody_saw_moves_nothing(cell: Cell) -> None:
     heightmap = cell.observe()
     heightmap.header.stamp.sec += 1000
@@ -267,3 +286,35 @@ def test_a_proposal_from_before_the_last_motion_moves_nothing(cell: Cell) -> Non
     proposal = cell.propose(heightmap)
     assert cell.decide(proposal.id).duration.sec > 0
     refused(cell, cell.decide(cell.propose(heightmap).id), "before the last motion")
+
+
+def test_nobody_on_the_network_weakens_what_the_executor_asks_for(start) -> None:
+    domain = free_domain()
+    start("sim_workcell", "--ros-args", "-p", "problem:=placing", "-p", "seed:=10000", domain=domain)
+    start("suction_executor", "--ros-args", "-p", "use_sim_time:=true", "-p", "require_approval:=unsure", domain=domain)
+    with Operator(domain) as operator:
+        cell = Cell(operator)
+        cell.wait_until_ready()
+        client = operator.node.create_client(SetParameters, "suction_executor/set_parameters")
+        operator.until(client.service_is_ready, "parameters of the executor", 30.0)
+        weaker = {
+            "require_approval": "never",
+            "sure_probability": 0.0,
+            "presence_timeout_s": 1000.0,
+            "stop_file": "/dev/null",
+            "limits.travel_m_s": 9.0,
+            "joints.acceleration_rad_s2": 99.0,
+            "observation_changed_area_mm2": 1e6,
+            "observation_max_age_s": 1000.0,
+            "collision_margin_m": 0.0,
+            "driver.enable_pin": 3,
+            "driver.status_max_age_s": 1000.0,
+        }
+        request = SetParameters.Request(parameters=[Parameter(name, value=value).to_parameter_msg() for name, value in weaker.items()])
+        answer = client.call_async(request)
+        operator.until(answer.done, "answer of the executor", 30.0)
+        for name, result in zip(weaker, answer.result().results, strict=True):
+            assert not result.successful and f"{name} is read when the node is started" in result.reason, result
+        # It is not sure to succeed, and nobody is asked.
+        cell.propose(cell.observe(), lambda proposal: setattr(proposal, "success_probability", 0.5))
+        cell.assert_still()

@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
+import importlib.util
 import pathlib
+import signal
+import sys
 import uuid
+from typing import Any
 
 import numpy as np
+import pyarrow.parquet
 import pytest
 from action_msgs.msg import GoalStatus
+from bag_contents import contents
 from cell_operator import Operator, nanoseconds
 from geometry_msgs.msg import Pose2D
-from processes import free_domain
+from processes import REPOSITORY, free_domain
 from rclpy.action import ActionClient
 from rclpy.client import Client
 from sctn_msgs.action import ExecutePickPlace
@@ -18,6 +24,20 @@ from sctn_msgs.msg import Goal, Heightmap, PickPlace, PrimitiveSettings, StepCon
 from sctn_msgs.srv import CaptureGoal, LoadDemonstration, ResetCell, SetStep
 
 SETTINGS = PrimitiveSettings(clearance_m=0.12, lift_m=0.08, travel_m_s=0.5, carry_m_s=0.25, descend_m_s=0.05, acceleration_m_s2=1.0)
+
+
+# A disk of placing with seed 10000.
+DISK = Pose2D(x=0.4354, y=0.1635, theta=0.0)
+
+
+def console_client() -> Any:
+    """The example client of the operator's page as a module."""
+    path = REPOSITORY / "docs/examples/operator_console.py"
+    specification = importlib.util.spec_from_file_location("operator_console_client", path)
+    module = importlib.util.module_from_spec(specification)
+    sys.modules[specification.name] = module
+    specification.loader.exec_module(module)
+    return module
 
 
 class Cell:
@@ -247,6 +267,50 @@ def test_a_goal_waits_for_its_approval_and_says_its_phases(cell: Cell) -> None:
     assert cell.operator.next("step_result", 0, lambda said: said.proposal_id == proposal.id) == result
     # A late question for the result has the same answer.
     assert cell.result(handle).result.result == result
+
+
+def test_a_goal_is_seen_by_page_and_oracle_and_a_bag_of_the_run_holds_it_as_a_step(
+    cell: Cell, start, demonstration: pathlib.Path, tmp_path: pathlib.Path
+) -> None:
+    operator = cell.operator
+    began = cell.call(cell.reset, ResetCell.Request(request_id=name(), problem="placing", seed=10000))
+    operator.next("heightmap", 0, lambda made: nanoseconds(made.header.stamp) >= nanoseconds(began.stamp))
+    goals = operator.count("goal")
+    cell.call(cell.load, LoadDemonstration.Request(request_id=name(), path=str(demonstration)))
+    goal = newest_goal(cell, goals, step=1)
+    address = tmp_path / "address"
+    start("operator_console", "--ros-args", "-p", "port:=0", "-p", f"address_file:={address}", "-p", "use_sim_time:=true")
+    bag = tmp_path / "run"
+    topics = ["heightmap", "pick_place", "pick_place_goal", "step_confirmation", "step_result", "reward"]
+    recorder = start("sctn", "bag", "record", *(f"/{topic}" for topic in topics), "--out", bag, "--json")
+    # Oracle, page and recorder; and for confirmations the executor.
+    operator.until(lambda: len(operator.node.get_subscriptions_info_by_topic("/pick_place_goal")) >= 3, "readers of goals", 60.0)
+    operator.listeners = 4
+    operator.until(lambda: operator.has_heard("operator_console", "/heightmap"), "page that sees the cell", 60.0)
+    page = console_client().Console(address.read_text().strip(), "a program")
+    try:
+        proposal = cell.proposal(pick=DISK, attempt=goal.attempt)
+        handle, feedback = cell.send(proposal)
+        cell.awaits_approval(feedback)
+        operator.until(lambda: (page.state()["proposal"] or {}).get("id") == str(proposal.id), "proposal on the page", 60.0)
+        operator.confirm(proposal.id, StepConfirmation.APPROVE)
+        end = cell.result(handle).result.result
+        assert end.outcome == StepResult.PLACED, end
+        operator.next("heightmap", 0, lambda made: nanoseconds(made.header.stamp) >= nanoseconds(end.header.stamp))
+        goals = operator.count("goal")
+        operator.confirm(proposal.id, StepConfirmation.ADVANCE)
+        newest_goal(cell, goals, step=2)
+    finally:
+        operator.listeners = 1
+    recorder.signal(signal.SIGINT)
+    assert recorder.wait(60.0) == 0, recorder.log()
+    assert [said for _, said in contents(bag, "/pick_place_goal") if said.id == proposal.id]
+    data = tmp_path / "data"
+    export = start("sctn", "bag", "export", bag, "--out", data, "--json")
+    assert export.wait(60.0) == 0, export.log()
+    (step,) = pyarrow.parquet.read_table(data / "data").to_pylist()
+    poses = [coordinate for pose in (proposal.pick, proposal.place) for coordinate in (pose.x, pose.y, pose.theta)]
+    assert np.allclose(step["action"], poses, atol=1e-6)
 
 
 def test_one_goal_runs_and_others_are_rejected_with_a_reason(cell: Cell) -> None:

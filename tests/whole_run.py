@@ -1,4 +1,7 @@
-"""A whole run with a driver as it is: whole_run.py PROBLEM SEED MOST_PROPOSALS.
+"""A whole run with driver and cameras as they are: whole_run.py PROBLEM SEED MOST_PROPOSALS [CONTACT [CHECKPOINT]].
+
+CONTACT: the executor's `driver.contact`; with `height` the robot is a CB3, which knows no tool contact and no `trajectory_until_node`.
+The demonstration is one of the same cell on another day: as its cameras saw it, with another light and other noise.
 
 Prints its result as a line of JSON, and where it is not complete the logs on standard error.
 Everything happens in real time: a disk takes some 10 s, of which the driver takes 3 s to accept two descents.
@@ -26,7 +29,8 @@ from cell_operator import Operator
 from sctn_msgs.msg import StepConfirmation, StepResult
 
 REALISTIC = REPOSITORY / "config/hardware/realistic.yaml"
-CHECKPOINT = REPOSITORY / "config/checkpoints/ten_problems.safetensors"
+PERTURBATION = REPOSITORY / "config/perturbations/realsense.yaml"
+CHECKPOINTS = REPOSITORY / "config/checkpoints"
 # What ends a run.
 BROKEN_OFF = (StepResult.FAULT, StepResult.STOPPED, StepResult.REFUSED)
 
@@ -72,6 +76,11 @@ def main() -> None:
     # What was started is ended then too.
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(1))
     problem, seed, most_proposals = sys.argv[1], int(sys.argv[2]), int(sys.argv[3])
+    contact = sys.argv[4] if len(sys.argv) > 4 else "until_action"
+    robot = {"hardware__software_major": 3} if contact == "height" else {}
+    # A robot that senses no contact is sure to touch what it is to grip only where it goes a little further.
+    sign = {"driver__contact": contact} | ({"contact__press_m": 0.003} if contact == "height" else {})
+    checkpoint = CHECKPOINTS / f"{sys.argv[5] if len(sys.argv) > 5 else 'any_start'}.safetensors"
     domain = free_domain()
     with tempfile.TemporaryDirectory() as folder, contextlib.ExitStack() as stack:
         logs = pathlib.Path(folder)
@@ -82,16 +91,18 @@ def main() -> None:
             stack.callback(started[-1].end)
             return started[-1]
 
-        demos = start("sctn", "demos", "--problem", problem, "--episodes", 1, "--seed", seed, "--out", logs / "demos")
+        demos = start(
+            "sctn", "demos", "--problem", problem, "--episodes", 1, "--seed", seed, "--perturb", PERTURBATION, "--out", logs / "demos",
+        )  # fmt: skip
         if demos.wait(120.0):
             sys.exit(demos.log())
         (demonstration,) = [file.parent for file in (logs / "demos").rglob("metadata.yaml")]
-        operator = stack.enter_context(Operator(domain))
-        start("sim_workcell", *parameters("sim_workcell", problem=problem, seed=seed))
+        operator = stack.enter_context(Operator(domain, topics=("goal", "pick_place", "step_result", "reward")))
+        start("sim_workcell", *parameters("sim_workcell", problem=problem, seed=seed, **robot))
         start("camera_fusion", *parameters("camera_fusion"))
         start("goal_oracle", *parameters("goal_oracle", demonstration=demonstration))
-        start("gctn_policy", *parameters("gctn_policy", checkpoint=CHECKPOINT))
-        start("suction_executor", *parameters("suction_executor"))
+        start("gctn_policy", *parameters("gctn_policy", checkpoint=checkpoint))
+        start("suction_executor", *parameters("suction_executor", **sign))
         operator.listeners = 3
         begin = time.monotonic()
         try:

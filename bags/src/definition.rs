@@ -7,7 +7,7 @@ use std::sync::OnceLock;
 /// What stands between the definitions of a type and of those it depends on.
 const SEPARATOR: &str =
     "================================================================================";
-/// What is no type of its own.
+/// Primitive types: they have no definition.
 const PRIMITIVES: [&str; 18] = [
     "bool", "byte", "char", "float32", "float64", "int8", "uint8", "int16", "uint16", "int32",
     "uint32", "int64", "uint64", "string", "wstring", "duration", "time", "octet",

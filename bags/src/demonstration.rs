@@ -136,7 +136,8 @@ impl Demonstration {
         name
     }
 
-    fn goal_steps(&self) -> Vec<usize> {
+    /// Indices of the steps after which an image is a goal: see [`step_protocol::goal_steps`].
+    pub fn goal_steps(&self) -> Vec<usize> {
         goal_steps(self.steps.iter().map(|step| step.delta_reward))
     }
 

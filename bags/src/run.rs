@@ -22,7 +22,7 @@ pub struct LeftOut {
     pub attempt: u32,
     /// The proposal.
     pub proposal_id: u64,
-    /// Why.
+    /// The reason.
     pub reason: String,
 }
 
@@ -45,10 +45,16 @@ fn ns(stamp: &Time) -> u64 {
     u64::try_from(stamp.sec).unwrap_or(0) * 1_000_000_000 + u64::from(stamp.nanosec)
 }
 
+/// Whether the executor publishes there the proposals that came as goals of its action.
+fn is_of_goals(topic: &str) -> bool {
+    topic.rsplit('/').next() == Some("pick_place_goal")
+}
+
 /// The topics of a run that matter here.
 struct Topics<'a> {
     heightmaps: &'a str,
-    proposals: &'a str,
+    /// Those on a topic, and those that came as goals of the executor's action: one of both at least.
+    proposals: Vec<&'a str>,
     confirmations: &'a str,
     results: &'a str,
     rewards: Option<&'a str>,
@@ -57,34 +63,41 @@ struct Topics<'a> {
 impl<'a> Topics<'a> {
     /// None if the bag is no recorded run: nobody confirmed anything in it.
     fn find(bag: &'a BagReader, path: &Path) -> Result<Option<Self>, DemonstrationError> {
-        let of_type = |type_name: &'static str| {
+        let names_of = |type_name: &str| -> Vec<&'a str> {
             let found = bag.topics().iter();
             let found =
                 found.filter(|topic| topic.type_name == type_name && topic.message_count > 0);
-            let names: Vec<&str> = found.map(|topic| topic.name.as_str()).collect();
-            match names[..] {
-                [] => Ok(None),
-                [name] => Ok(Some(name)),
-                _ => Err(DemonstrationError::Topics {
-                    path: path.to_owned(),
-                    type_name,
-                    found: names.join(", "),
-                }),
-            }
+            found.map(|topic| topic.name.as_str()).collect()
+        };
+        let refuse = |type_name, found| DemonstrationError::Topics {
+            path: path.to_owned(),
+            type_name,
+            found,
+        };
+        let of_type = |type_name: &'static str| match names_of(type_name)[..] {
+            [] => Ok(None),
+            [name] => Ok(Some(name)),
+            ref names => Err(refuse(type_name, names.join(", "))),
         };
         let Some(confirmations) = of_type(StepConfirmation::TYPE_NAME)? else {
             return Ok(None);
         };
-        let needed = |type_name| {
-            of_type(type_name)?.ok_or_else(|| DemonstrationError::Topics {
-                path: path.to_owned(),
-                type_name,
-                found: "none".to_owned(),
-            })
+        let needed =
+            |type_name| of_type(type_name)?.ok_or_else(|| refuse(type_name, "none".to_owned()));
+        let heightmaps = needed(sctn_msgs::Heightmap::TYPE_NAME)?;
+        let proposals = names_of(sctn_msgs::PickPlace::TYPE_NAME);
+        let goals = proposals.iter().filter(|name| is_of_goals(name)).count();
+        let found = match (proposals.len(), goals) {
+            (0, _) => Some("none".to_owned()),
+            (all, goals) if goals > 1 || all - goals > 1 => Some(proposals.join(", ")),
+            _ => None,
         };
+        if let Some(found) = found {
+            return Err(refuse(sctn_msgs::PickPlace::TYPE_NAME, found));
+        }
         Ok(Some(Self {
-            heightmaps: needed(sctn_msgs::Heightmap::TYPE_NAME)?,
-            proposals: needed(sctn_msgs::PickPlace::TYPE_NAME)?,
+            heightmaps,
+            proposals,
             confirmations,
             results: needed(StepResult::TYPE_NAME)?,
             rewards: of_type(Reward::TYPE_NAME)?,
@@ -249,20 +262,16 @@ fn gather(bag: &BagReader, topics: &Topics<'_>) -> Result<Gathered, Demonstratio
     let mut results: BTreeMap<u64, StepResult> = BTreeMap::new();
     let mut rewards = BTreeMap::new();
     let mut seen = BTreeSet::new();
-    let names = [
-        topics.heightmaps,
-        topics.proposals,
-        topics.confirmations,
-        topics.results,
-    ];
-    let names: Vec<&str> = names.into_iter().chain(topics.rewards).collect();
+    let names = [topics.heightmaps, topics.confirmations, topics.results];
+    let names = names.into_iter().chain(topics.rewards);
+    let names: Vec<&str> = names.chain(topics.proposals.iter().copied()).collect();
     for message in bag.messages_between(&names, Duration::ZERO, Duration::MAX) {
         let message = message?;
         let name = message.topic.name.as_str();
         if name == topics.heightmaps {
             let heightmap: sctn_msgs::Heightmap = message.decode()?;
             seen.insert(ns(&heightmap.header.stamp));
-        } else if name == topics.proposals {
+        } else if topics.proposals.contains(&name) {
             let proposal: sctn_msgs::PickPlace = message.decode()?;
             let id = proposal.id;
             attempts.entry(id).or_insert_with(|| {

@@ -16,7 +16,7 @@ pub(crate) const MAX_RECORD_BYTES: u64 = 256 << 20;
 const RECORD_HEADER: u64 = 9;
 /// A chunk's fields before the name of its compression.
 const CHUNK_FIELDS: usize = 8 + 8 + 8 + 4 + 4;
-/// Nobody's compression has a longer name.
+/// Length of the longest name of a compression.
 const MAX_COMPRESSION_NAME: usize = 16;
 /// How much of the file is searched at a time for the next sound record.
 const WINDOW_BYTES: usize = 1 << 20;
@@ -56,7 +56,7 @@ pub(crate) enum Event<'a> {
         /// Its records, uncompressed.
         records: &'a [u8],
     },
-    /// Bytes that are nothing.
+    /// Bytes that are not a record.
     Damage(Damage),
 }
 

@@ -41,6 +41,7 @@ fn what_an_older_recording_lacks_has_its_default_and_the_rest_is_there() {
         (1, "placing")
     );
     assert_eq!(proposals[0].success_probability, -1.0);
+    assert_eq!(proposals[0].done_probability, -1.0);
     assert_eq!(
         (
             proposals[0].checkpoint.as_str(),
@@ -74,6 +75,7 @@ fn only_whole_fields_that_were_added_may_be_missing() {
         checkpoint: "a checkpoint".into(),
         author: "somebody".into(),
         module: "placing".into(),
+        done_probability: 0.25,
         ..PickPlace::default()
     };
     let bytes = to_cdr(&message).unwrap();
@@ -82,7 +84,7 @@ fn only_whole_fields_that_were_added_may_be_missing() {
     let accepted: Vec<usize> = (4..bytes.len())
         .filter(|length| from_recorded_cdr::<PickPlace>(&bytes[..*length]).is_ok())
         .collect();
-    // Before success_probability, before checkpoint, before author; and with padding of zeros.
+    // Before success_probability, checkpoint, author or done_probability; and with padding of zeros.
     let first = accepted[0];
     let whole: PickPlace = from_recorded_cdr(&bytes[..first]).unwrap();
     assert_eq!(
@@ -95,7 +97,16 @@ fn only_whole_fields_that_were_added_may_be_missing() {
             ["", "a checkpoint"].contains(&read.checkpoint.as_str()),
             "{read:?}"
         );
-        assert_eq!(read.author, "");
+        assert!(["", "somebody"].contains(&read.author.as_str()), "{read:?}");
+        // Cut or whole: the default, or what was written.
+        assert_eq!(
+            read.done_probability,
+            if *length == bytes.len() {
+                message.done_probability
+            } else {
+                -1.0
+            }
+        );
     }
     for length in 4..first {
         let cut = from_recorded_cdr::<PickPlace>(&bytes[..length]);

@@ -59,7 +59,11 @@ impl Run {
         self.write("/cell/heightmap", &message);
     }
 
-    fn propose(&mut self, id: u64, (step, attempt): (u32, u32), second: i32) {
+    fn propose(&mut self, id: u64, step_and_attempt: (u32, u32), second: i32) {
+        self.propose_on("/cell/pick_place", id, step_and_attempt, second);
+    }
+
+    fn propose_on(&mut self, topic: &str, id: u64, (step, attempt): (u32, u32), second: i32) {
         let proposal = PickPlace {
             header: header(second),
             id,
@@ -75,7 +79,7 @@ impl Run {
             module: format!("module {step}"),
             ..PickPlace::default()
         };
-        self.write("/cell/pick_place", &proposal);
+        self.write(topic, &proposal);
     }
 
     fn say(&mut self, id: u64, decision: u8) {
@@ -206,6 +210,61 @@ fn a_cell_without_rewards_teaches_too() {
     assert_eq!(
         demonstration.steps[0].delta_reward + demonstration.steps[1].delta_reward,
         1.0
+    );
+}
+
+#[test]
+fn a_step_that_came_as_a_goal_of_the_action_is_one_like_the_others() {
+    let folder = TempDir::new().unwrap();
+    for (with_topic, steps) in [(true, 2), (false, 1)] {
+        let path = folder.path().join(format!("run_{with_topic}"));
+        let mut run = Run::new(&path);
+        run.see(1);
+        if with_topic {
+            run.propose(10, (1, 0), 1);
+            run.say(10, StepConfirmation::APPROVE);
+            run.end(10, StepResult::PLACED, 5);
+            run.say(10, StepConfirmation::ADVANCE);
+            run.see(5);
+        }
+        run.propose_on(
+            "/cell/pick_place_goal",
+            20,
+            (2, 0),
+            if with_topic { 5 } else { 1 },
+        );
+        run.say(20, StepConfirmation::APPROVE);
+        run.end(20, StepResult::PLACED, 9);
+        run.say(20, StepConfirmation::ADVANCE);
+        run.see(9);
+        run.bag.finish().unwrap();
+        let (demonstration, left_out) = Demonstration::read_run(&path).unwrap().unwrap();
+        assert_eq!(left_out, []);
+        assert_eq!(demonstration.steps.len(), steps);
+        let last = demonstration.steps.last().unwrap();
+        assert_eq!(
+            (last.module.as_str(), last.action.pick.translation.y),
+            ("module 2", 0.2)
+        );
+        assert_eq!(demonstration.last, heightmap(9));
+    }
+}
+
+#[test]
+fn goals_of_two_cells_in_one_bag_are_told() {
+    let folder = TempDir::new().unwrap();
+    let path = folder.path().join("run");
+    let mut run = Run::new(&path);
+    run.see(1);
+    run.say(1, StepConfirmation::APPROVE);
+    run.end(1, StepResult::PLACED, 5);
+    run.propose_on("/cell/pick_place_goal", 1, (1, 0), 1);
+    run.propose_on("/other/pick_place_goal", 2, (1, 0), 1);
+    run.bag.finish().unwrap();
+    let error = Demonstration::read(&path).unwrap_err().to_string();
+    assert!(
+        error.contains("/cell/pick_place_goal, /other/pick_place_goal"),
+        "{error}"
     );
 }
 

@@ -9,7 +9,7 @@ use clap::Args;
 use cpu_time::ThreadTime;
 use criterion::Criterion;
 use gctn::{Device, NetworkConfig, Policy, Precision, Trainer, TrainingConfig};
-use heightmap::{Fusion, Heightmap, View, Workspace};
+use heightmap::{Fusion, Heightmap, StillFusion, StillSettings, View, Workspace};
 use learning::{DataSet, DrawRules, Sampling, Shown, demonstrate, goal};
 use multiravens::{Environment, Problem};
 use rand::SeedableRng;
@@ -33,6 +33,9 @@ pub struct Bench {
     /// Seconds of `camera_stream`, and about those of `device_speed`
     #[arg(long, default_value_t = 60.0)]
     seconds: f64,
+    /// Sets of images that each heightmap of `camera_stream` is the median of
+    #[arg(long, default_value_t = 1, value_parser = clap::value_parser!(u8).range(1..=31))]
+    frames: u8,
     #[command(flatten)]
     on_device: DeviceArguments,
     /// Print a JSON object last
@@ -47,6 +50,8 @@ struct Workload {
     threads: usize,
     /// The same work in the original (PyBullet, numpy, TensorFlow), where it was measured.
     original_s: Option<f64>,
+    /// What the median may be.
+    limit_s: Option<f64>,
     /// Iterations measured, at least.
     samples: usize,
     run: fn(&Root, &mut Criterion, &str) -> Result<()>,
@@ -59,13 +64,23 @@ const WORKLOADS: &[Workload] = &[
         name: "fusion",
         threads: 1,
         original_s: Some(0.176),
+        limit_s: None,
         samples: 50,
         run: fusion,
+    },
+    Workload {
+        name: "still_fusion",
+        threads: 1,
+        original_s: None,
+        limit_s: None,
+        samples: 50,
+        run: still_fusion,
     },
     Workload {
         name: "rendering",
         threads: 1,
         original_s: Some(0.766),
+        limit_s: None,
         samples: 50,
         run: rendering,
     },
@@ -73,6 +88,7 @@ const WORKLOADS: &[Workload] = &[
         name: "inverse_kinematics",
         threads: 1,
         original_s: None,
+        limit_s: None,
         samples: 50,
         run: inverse_kinematics,
     },
@@ -80,6 +96,7 @@ const WORKLOADS: &[Workload] = &[
         name: "physics_step",
         threads: 1,
         original_s: Some(1.0 / 6870.0),
+        limit_s: None,
         samples: 20,
         run: physics_step,
     },
@@ -87,6 +104,7 @@ const WORKLOADS: &[Workload] = &[
         name: "decision_compact",
         threads: 1,
         original_s: Some(5.26),
+        limit_s: None,
         samples: 20,
         run: decision_compact,
     },
@@ -94,6 +112,7 @@ const WORKLOADS: &[Workload] = &[
         name: "decision_matching",
         threads: 1,
         original_s: Some(5.26),
+        limit_s: None,
         samples: 20,
         run: decision_matching,
     },
@@ -101,6 +120,7 @@ const WORKLOADS: &[Workload] = &[
         name: "decision_resnet43",
         threads: 2,
         original_s: Some(5.26),
+        limit_s: None,
         samples: 10,
         run: decision_resnet43,
     },
@@ -108,6 +128,7 @@ const WORKLOADS: &[Workload] = &[
         name: "decision_resnet43_bf16",
         threads: 2,
         original_s: Some(5.26),
+        limit_s: None,
         samples: 10,
         run: decision_resnet43_bf16,
     },
@@ -115,6 +136,7 @@ const WORKLOADS: &[Workload] = &[
         name: "training_sample_compact",
         threads: 1,
         original_s: Some(27.4),
+        limit_s: None,
         samples: 20,
         run: training_sample_compact,
     },
@@ -122,6 +144,7 @@ const WORKLOADS: &[Workload] = &[
         name: "training_sample_matching",
         threads: 1,
         original_s: Some(27.4),
+        limit_s: None,
         samples: 20,
         run: training_sample_matching,
     },
@@ -129,6 +152,7 @@ const WORKLOADS: &[Workload] = &[
         name: "training_step_resnet43",
         threads: 2,
         original_s: Some(27.4),
+        limit_s: None,
         samples: 10,
         run: training_step_resnet43,
     },
@@ -136,8 +160,17 @@ const WORKLOADS: &[Workload] = &[
         name: "frame_to_proposal",
         threads: 1,
         original_s: None,
+        limit_s: None,
         samples: 10,
         run: frame_to_proposal,
+    },
+    Workload {
+        name: "still_frames_to_proposal",
+        threads: 1,
+        original_s: None,
+        limit_s: Some(0.04),
+        samples: 10,
+        run: still_frames_to_proposal,
     },
 ];
 
@@ -146,7 +179,13 @@ struct Figure {
     median_s: f64,
     threads: usize,
     original_s: Option<f64>,
+    limit_s: Option<f64>,
 }
+
+/// Processor time that the fusion of three cameras at 30 Hz may take, in cores.
+const FUSION_CORES: f64 = 0.5;
+/// Sets of images that the fusion of real cameras takes the median of, as real_cell.launch.py sets it.
+const STILL_FRAMES: u32 = 5;
 
 /// Reset and one demonstration in the original (PyBullet), where it was measured.
 const ORIGINAL_DEMONSTRATIONS_S: [(&str, f64); 3] =
@@ -223,6 +262,7 @@ impl Bench {
             let Workload {
                 threads,
                 original_s,
+                limit_s,
                 ..
             } = *workload;
             figures.insert(
@@ -231,6 +271,7 @@ impl Bench {
                     median_s,
                     threads,
                     original_s,
+                    limit_s,
                 },
             );
         }
@@ -246,6 +287,15 @@ impl Bench {
             println!("{}", serde_json::to_string(&report)?);
         } else {
             report.print();
+        }
+        for (name, figure) in &report.inner_loops {
+            if let Some(limit_s) = figure.limit_s.filter(|limit_s| figure.median_s > *limit_s) {
+                bail!(
+                    "{name}: {}, expected at most {}",
+                    time(figure.median_s),
+                    time(limit_s)
+                );
+            }
         }
         Ok(())
     }
@@ -323,20 +373,21 @@ impl Bench {
         Ok(())
     }
 
-    /// Fails where an image was lost.
+    /// Fails where an image was lost, or the fusion takes too much.
     fn camera_stream(&self, root: &Root) -> Result<()> {
         if !(self.seconds.is_finite() && self.seconds > 0.0) {
             bail!("--seconds {}: expected a positive number", self.seconds);
         }
-        let figures = crate::camera_stream::measure(root, self.seconds)?;
+        let figures = crate::camera_stream::measure(root, self.seconds, usize::from(self.frames))?;
         if self.json {
             println!("{}", serde_json::json!({"camera_stream": figures}));
         } else {
             println!(
-                "three cameras, colour of 1.04 MB and depth of 0.69 MB at 30 Hz, {} s, {:.0} MB/s: {} sets, {} heightmaps, {} images \
-                 lost",
+                "three cameras, colour of 1.04 MB and depth of 0.69 MB at 30 Hz, {} s, {:.0} MB/s, median of {}: {} sets, {} heightmaps, \
+                 {} images lost",
                 figures.seconds,
                 figures.mb_s,
+                figures.frames,
                 figures.sets,
                 figures.heightmaps,
                 figures.images_lost
@@ -347,6 +398,12 @@ impl Bench {
                 time(figures.latency_median_s),
                 time(figures.latency_p99_s),
                 time(figures.latency_max_s)
+            );
+        }
+        if figures.fusion_cores > FUSION_CORES {
+            bail!(
+                "camera_fusion takes {:.2} cores, expected at most {FUSION_CORES}",
+                figures.fusion_cores
             );
         }
         if figures.images_lost > 0 || figures.heightmaps < figures.sets {
@@ -392,6 +449,25 @@ fn fusion(root: &Root, criterion: &mut Criterion, name: &str) -> Result<()> {
     let (mut fusion, mut out) = (Fusion::default(), Heightmap::new(Workspace::RAVENS));
     criterion.bench_function(name, |b| {
         b.iter(|| fusion.fuse(black_box(&views), &mut out))
+    });
+    Ok(())
+}
+
+/// What a set of images costs where a heightmap is the median of several.
+fn still_fusion(root: &Root, criterion: &mut Criterion, name: &str) -> Result<()> {
+    let mut environment = environment(root)?;
+    environment.observe()?;
+    let views: Vec<View<'_>> = environment.cell().views().collect();
+    let mut fusion = StillFusion::new(StillSettings {
+        frames: STILL_FRAMES as usize,
+        ..StillSettings::default()
+    });
+    let mut out = Heightmap::new(Workspace::RAVENS);
+    criterion.bench_function(name, |b| {
+        b.iter(|| {
+            fusion.push(black_box(&views), &Workspace::RAVENS)?;
+            Ok::<_, heightmap::FusionError>(fusion.median(&mut out))
+        })
     });
     Ok(())
 }
@@ -533,7 +609,21 @@ fn decision(root: &Root, criterion: &mut Criterion, name: &str, policy: &Policy)
 
 /// Over DDS, from the last camera frame to the proposal, without what the network takes.
 fn frame_to_proposal(root: &Root, criterion: &mut Criterion, name: &str) -> Result<()> {
-    let mut chain = Chain::start(root, SEED)?;
+    frames_to_proposal(root, criterion, name, 1)
+}
+
+/// The same from the last of the frames of a still scene that the median takes.
+fn still_frames_to_proposal(root: &Root, criterion: &mut Criterion, name: &str) -> Result<()> {
+    frames_to_proposal(root, criterion, name, STILL_FRAMES)
+}
+
+fn frames_to_proposal(
+    root: &Root,
+    criterion: &mut Criterion,
+    name: &str,
+    frames: u32,
+) -> Result<()> {
+    let mut chain = Chain::start(root, SEED, frames)?;
     chain.warm_up()?;
     let mut failure = None;
     criterion.bench_function(name, |b| {

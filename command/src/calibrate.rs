@@ -5,12 +5,12 @@ use anyhow::{Context, Result, bail, ensure};
 use bags::BagReader;
 use calibration::{
     Board, BoardView, Calibration, CameraViews, GrayImage, View, board_pose, check_swapped, detect,
-    solve, table,
+    gray_pixels, solve, table,
 };
 use clap::Args;
 use heightmap::Intrinsics;
 use heightmap::picture::{self, RgbImage};
-use msgs::{convert, sensor_msgs};
+use msgs::{CameraPreset, convert, sensor_msgs};
 use nalgebra::{Isometry3, Point2};
 use serde::{Deserialize, Serialize};
 use std::collections::BTreeMap;
@@ -42,9 +42,12 @@ pub struct Calibrate {
     /// YAML file with the fields of `board`, for bags and for --draw-board
     #[arg(long, value_name = "FILE")]
     board: Option<PathBuf>,
-    /// Names of the cameras in a bag: topics NAME/color/image_raw and NAME/color/camera_info
+    /// Names of the cameras in a bag, with which the names of their topics begin
     #[arg(long, value_delimiter = ',', default_values_t = ["front".to_owned(), "left".to_owned(), "right".to_owned()])]
     cameras: Vec<String>,
+    /// Driver of the cameras, as the parameter camera_preset of camera_fusion: simulated, realsense, realsense_aligned, orbbec, zed or zed_5_0
+    #[arg(long, default_value_t = CameraPreset::Simulated)]
+    camera_preset: CameraPreset,
     /// The cell [default: urdf/workcell.urdf]
     #[arg(long, value_name = "FILE")]
     urdf: Option<PathBuf>,
@@ -113,13 +116,7 @@ impl Session {
     /// Takes an image; `pose` is the index of the joint position, or none for a board on the table.
     fn take(&mut self, camera: usize, pose: Option<usize>, rgb: &[u8]) {
         let intrinsics = self.cameras[camera].1;
-        let gray: Vec<u8> = rgb
-            .chunks_exact(3)
-            .map(|rgb| {
-                ((u32::from(rgb[0]) * 77 + u32::from(rgb[1]) * 150 + u32::from(rgb[2]) * 29) >> 8)
-                    as u8
-            })
-            .collect();
+        let gray = gray_pixels(rgb);
         let (width, height) = (intrinsics.width, intrinsics.height);
         let tags = detect(&GrayImage {
             width,
@@ -193,12 +190,18 @@ impl Session {
     }
 
     /// From a bag: the first image of each camera in each span of time in which the arm rests.
-    fn of_bag(path: &Path, board: Board, names: &[String], cell: &WorkCell) -> Result<Self> {
+    fn of_bag(
+        path: &Path,
+        board: Board,
+        names: &[String],
+        preset: CameraPreset,
+        cell: &WorkCell,
+    ) -> Result<Self> {
         let bag = BagReader::open(path)?;
         let topic = |name: &str| format!("/{name}");
         let mut cameras = Vec::new();
         for name in names {
-            let info = topic(&format!("{name}/color/camera_info"));
+            let info = topic(&preset.topics(name).color_info);
             let last = bag.last_before(&info, Duration::MAX)?;
             let message =
                 last.with_context(|| format!("{}: no message on {info}", path.display()))?;
@@ -210,7 +213,7 @@ impl Session {
         let mut session = Self::new(board, cameras)?;
         let images: Vec<String> = names
             .iter()
-            .map(|name| topic(&format!("{name}/color/image_raw")))
+            .map(|name| topic(&preset.topics(name).color))
             .collect();
         let mut topics: Vec<&str> = images.iter().map(String::as_str).collect();
         topics.push("/joint_states");
@@ -317,12 +320,13 @@ impl Calibrate {
         let session = if recording.join("session.yaml").exists() {
             Session::of_folder(recording)?
         } else {
-            Session::of_bag(recording, board, &self.cameras, &cell).with_context(|| {
-                format!(
-                    "{}: expected a folder with session.yaml, or a bag",
-                    recording.display()
-                )
-            })?
+            Session::of_bag(recording, board, &self.cameras, self.camera_preset, &cell)
+                .with_context(|| {
+                    format!(
+                        "{}: expected a folder with session.yaml, or a bag",
+                        recording.display()
+                    )
+                })?
         };
         let calibration = self.solve(&session, &cell)?;
         let report = self.report(&session, &calibration, &cell)?;

@@ -30,6 +30,8 @@ const TICKS_PER_S: f64 = 100.0;
 #[derive(Debug, Serialize)]
 pub struct Figures {
     pub seconds: f64,
+    /// Sets of images that a heightmap is the median of.
+    pub frames: usize,
     pub mb_s: f64,
     /// Sets of six images.
     pub sets: u64,
@@ -55,12 +57,13 @@ impl Drop for Fusion {
 }
 
 impl Fusion {
-    fn start(root: &Root, domain_id: u16) -> Result<Self> {
+    fn start(root: &Root, domain_id: u16, frames: usize) -> Result<Self> {
         let program = std::env::current_exe().context("path of the program")?;
         let executable = program.with_file_name("camera_fusion");
         let child = Command::new(&executable)
             .args(["--ros-args", "--params-file"])
             .arg(root.join("config/camera_fusion.yaml"))
+            .args(["-p", &format!("frames:={frames}")])
             .env("ROS_DOMAIN_ID", domain_id.to_string())
             .env("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
             .stdin(Stdio::null())
@@ -108,19 +111,19 @@ impl Source {
     }
 }
 
-/// Runs the benchmark for so many seconds.
-pub fn measure(root: &Root, seconds: f64) -> Result<Figures> {
+/// Runs the benchmark for so many seconds; a heightmap is the median of so many sets of images.
+pub fn measure(root: &Root, seconds: f64, frames: usize) -> Result<Figures> {
     let runtime = tokio::runtime::Builder::new_multi_thread()
         .enable_all()
         .build()?;
-    let figures = runtime.block_on(run(root, seconds));
+    let figures = runtime.block_on(run(root, seconds, frames));
     runtime.shutdown_timeout(Duration::from_millis(500));
     figures
 }
 
-async fn run(root: &Root, seconds: f64) -> Result<Figures> {
+async fn run(root: &Root, seconds: f64, frames: usize) -> Result<Figures> {
     let network = Network::unused()?;
-    let mut fusion = Fusion::start(root, network.domain_id)?;
+    let mut fusion = Fusion::start(root, network.domain_id, frames)?;
     let context = Context::new(network);
     let (node, _) = context.node::<NoParameters>("cameras", &RosArguments::default())?;
     let cameras = Camera::ravens().map(|camera| Camera {
@@ -238,6 +241,7 @@ async fn run(root: &Root, seconds: f64) -> Result<Figures> {
     };
     Ok(Figures {
         seconds,
+        frames,
         mb_s: bytes as f64 * RATE_HZ / 1e6,
         sets,
         heightmaps: latencies_s.len() as u64,

@@ -4,8 +4,7 @@ use crate::root::Root;
 use anyhow::{Context, Result, bail};
 use bags::Demonstration;
 use clap::Args;
-use gctn::{Goal, GoalConditioning, Policy};
-use heightmap::Heightmap;
+use gctn::{Device, Goal, GoalConditioning, Policy, Precision};
 use learning::recorded_run;
 use nalgebra::Isometry2;
 use pick_place::PickPlace;
@@ -19,6 +18,9 @@ pub struct Compare {
     /// Checkpoints of the policies
     #[arg(long, required = true, num_args = 1..)]
     checkpoints: Vec<PathBuf>,
+    /// Where the policies compute: cpu, cuda or cuda:N
+    #[arg(long, default_value_t)]
+    device: Device,
     /// Bags with steps that none of them was trained on: demonstrations, taught tasks or recorded runs
     #[arg(long, required = true, num_args = 1..)]
     demos: Vec<PathBuf>,
@@ -110,9 +112,11 @@ struct Report {
 
 impl Compare {
     pub fn run(self, _: &Root) -> Result<()> {
+        self.device.check()?;
         gctn::set_threads(1);
         let load = |path: &PathBuf| {
-            Policy::load(path).with_context(|| format!("--checkpoints: {}", path.display()))
+            Policy::load_for(path, self.device, Precision::F32)
+                .with_context(|| format!("--checkpoints: {}", path.display()))
         };
         let policies = self.checkpoints.iter().map(load);
         let policies: Vec<_> = policies.collect::<Result<_>>()?;
@@ -190,8 +194,8 @@ fn compare(path: &Path, shown: &Path, policies: &[Policy], steps: &mut Vec<Step>
     };
     let demonstration = read(path, "--demos")?;
     let shown_demonstration = read(shown, "--shown")?;
-    let goals = goals_of(&shown_demonstration);
-    let progress = earning_steps(&demonstration);
+    let goals = shown_demonstration.goals();
+    let progress = demonstration.goal_steps();
     if progress.len() != goals.len() {
         bail!(
             "--shown: {} has {} steps that brought the table closer to the goal, expected {}, as {} has",
@@ -201,7 +205,9 @@ fn compare(path: &Path, shown: &Path, policies: &[Policy], steps: &mut Vec<Step>
             path.display()
         );
     }
-    for (index, (before, after)) in progress.into_iter().zip(goals) {
+    // The image before a goal shows what the steps before it have done.
+    let begins = std::iter::once(shown_demonstration.observation(0)).chain(goals.iter().copied());
+    for (index, (before, after)) in progress.into_iter().zip(begins.zip(goals.iter().copied())) {
         let step = &demonstration.steps[index];
         let propose = |policy: &Policy| {
             let goal = match policy.config().conditioning {
@@ -230,30 +236,6 @@ fn compare(path: &Path, shown: &Path, policies: &[Policy], steps: &mut Vec<Step>
         });
     }
     Ok(())
-}
-
-/// Indices of the steps that brought the table closer to the goal.
-fn earning_steps(demonstration: &Demonstration) -> Vec<usize> {
-    let steps = demonstration.steps.iter().enumerate();
-    let earning = steps.filter(|(_, step)| step.delta_reward > 0.0);
-    earning.map(|(index, _)| index).collect()
-}
-
-/// The images before and after each of these steps. The one before shows what the step before it has done.
-fn goals_of(demonstration: &Demonstration) -> Vec<(&Heightmap, &Heightmap)> {
-    let ends = earning_steps(demonstration)
-        .into_iter()
-        .map(|index| index + 1);
-    let begins = std::iter::once(0).chain(ends.clone());
-    let images = begins.zip(ends);
-    images
-        .map(|(before, after)| {
-            (
-                demonstration.observation(before),
-                demonstration.observation(after),
-            )
-        })
-        .collect()
 }
 
 #[cfg(test)]

@@ -3,7 +3,7 @@
 use crate::root::Root;
 use anyhow::{Context as _, Result};
 use clap::Args;
-use node_kit::{Context, Network, RosArguments, wait_for_end};
+use node_kit::{Context, RosArguments, wait_for_end};
 
 /// Arguments of `sctn console`.
 #[derive(Args)]
@@ -31,6 +31,7 @@ pub struct ConsoleCommand {
 impl ConsoleCommand {
     pub fn run(self, root: &Root) -> Result<()> {
         let file = root.join("config/operator_console.yaml");
+        let enclave = ["--enclave", "/sctn/operator_console"].map(str::to_owned);
         let mut words = vec!["--ros-args".to_owned(), "--params-file".into()];
         words.push(file.display().to_string());
         let given = [
@@ -45,14 +46,14 @@ impl ConsoleCommand {
                 words.extend(["-p".to_owned(), format!("{name}:={value}")]);
             }
         }
-        words.extend(self.ros);
+        words.extend(enclave.into_iter().chain(self.ros));
         let (arguments, _) = RosArguments::parse(words)?;
         let runtime = tokio::runtime::Builder::new_multi_thread()
             .enable_all()
             .build()
             .context("tokio runtime")?;
         runtime.block_on(async {
-            let context = Context::new(Network::from_environment()?);
+            let context = Context::from_environment()?;
             let mut node =
                 context.start("operator_console", &arguments, operator_console::configure)?;
             tokio::select! {

@@ -1,10 +1,10 @@
 //! `sctn decide`.
 
+use crate::policy::PolicyArguments;
 use crate::root::Root;
 use anyhow::{Context as _, Result};
 use bags::Demonstration;
 use clap::Args;
-use gctn::Policy;
 use learning::goal;
 use nalgebra::Isometry2;
 use serde::Serialize;
@@ -15,9 +15,8 @@ use std::path::PathBuf;
 pub struct Decide {
     /// Bag of a demonstration or of a recorded run
     bag: PathBuf,
-    /// Checkpoint of the policy [default: the shipped one]
-    #[arg(long)]
-    checkpoint: Option<PathBuf>,
+    #[command(flatten)]
+    policy: PolicyArguments,
 }
 
 /// What a policy decides before a step, shown what the demonstration reached next.
@@ -36,8 +35,7 @@ struct Step {
 
 impl Decide {
     pub fn run(self, root: &Root) -> Result<()> {
-        let checkpoint = self.checkpoint.unwrap_or_else(|| root.shipped_checkpoint());
-        let policy = Policy::load(&checkpoint)?;
+        let policy = self.policy.load(root)?;
         let demonstration = Demonstration::read(&self.bag)?;
         let goals = demonstration.goals();
         let first = demonstration.observation(0);

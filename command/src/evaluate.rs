@@ -1,12 +1,13 @@
 //! `sctn evaluate`.
 
 use crate::picture::scores;
+use crate::policy::PolicyArguments;
 use crate::progress;
 use crate::root::Root;
 use anyhow::{Context, Result, bail};
 use camera_noise::Perturbation;
 use clap::{Args, ValueEnum};
-use gctn::{Device, Policy, Precision};
+use gctn::Policy;
 use heightmap::picture::{self, RgbImage};
 use learning::{Actor, Attempt, Episodes, Evaluation, Start, evaluate, goal};
 use std::path::PathBuf;
@@ -16,9 +17,8 @@ use step_protocol::ReachedGoals;
 /// Arguments of `sctn evaluate`.
 #[derive(Args)]
 pub struct Evaluate {
-    /// Checkpoint of the policy [default: the shipped one]
-    #[arg(long)]
-    checkpoint: Option<PathBuf>,
+    #[command(flatten)]
+    policy: PolicyArguments,
     /// Problem to solve
     #[arg(long)]
     problem: String,
@@ -37,9 +37,6 @@ pub struct Evaluate {
     /// What the cameras do to observations and goals, a file as those of config/perturbations [default: perfect cameras]
     #[arg(long)]
     perturb: Option<PathBuf>,
-    /// Where the policy computes: cpu, cuda or cuda:N
-    #[arg(long, default_value_t)]
-    device: Device,
     /// Episodes at a time [default: one per core]
     #[arg(long)]
     threads: Option<usize>,
@@ -86,23 +83,17 @@ impl From<StartArgument> for Start {
 
 impl Evaluate {
     pub fn run(self, root: &Root) -> Result<()> {
-        self.device.check()?;
         let problem = root.problem(&self.problem)?;
         let work_cell = root.work_cell()?;
         let perturbation = self.perturb.as_deref().map(Perturbation::load);
         let perturbation = perturbation.transpose()?;
-        let checkpoint = self.checkpoint.unwrap_or_else(|| root.shipped_checkpoint());
         let cores = std::thread::available_parallelism().map_or(1, |cores| cores.get());
         // One decision on one thread, several episodes at a time: the same bits whatever the machine.
         gctn::set_threads(1);
         let mut actors: Vec<_> = (0..self.threads.unwrap_or(cores).max(1))
             .map(|_| match self.baseline {
                 Some(Baseline::Difference) => Ok(Actor::Difference),
-                None => Ok(Actor::from(Policy::load_for(
-                    &checkpoint,
-                    self.device,
-                    Precision::F32,
-                )?)),
+                None => Ok(Actor::from(self.policy.load(root)?)),
             })
             .collect::<Result<_>>()?;
         let plan = Episodes {

@@ -1,10 +1,11 @@
 //! `sctn goals`: how often goal modules name the right goal.
 
+use crate::policy::PolicyArguments;
 use crate::progress;
 use crate::root::Root;
 use anyhow::{Context, Result};
 use clap::Args;
-use gctn::{Embedding, Policy};
+use gctn::Embedding;
 use heightmap::Heightmap;
 use learning::{Actor, Start, attempt, known_images, reached, wilson_95};
 use multiravens::Environment;
@@ -30,9 +31,8 @@ pub struct Goals {
     /// Seed of the first episode; the next ones are seed + 2, seed + 4, ... (test: from 10,000 up)
     #[arg(long)]
     seed: u64,
-    /// Checkpoint of the policy [default: the shipped one]
-    #[arg(long)]
-    checkpoint: Option<PathBuf>,
+    #[command(flatten)]
+    policy: PolicyArguments,
     /// Checkpoint of the embedding [default: the shipped one]
     #[arg(long)]
     embedding: Option<PathBuf>,
@@ -74,10 +74,9 @@ struct Report {
 impl Goals {
     pub fn run(self, root: &Root) -> Result<()> {
         let problem = root.problem(&self.problem)?;
-        let checkpoint = self.checkpoint.unwrap_or_else(|| root.shipped_checkpoint());
         let embedding = self.embedding.unwrap_or_else(|| root.shipped_embedding());
         gctn::set_threads(1);
-        let actor = Actor::from(Policy::load(&checkpoint)?);
+        let actor = Actor::from(self.policy.load(root)?);
         let embedding = Embedding::load(&embedding)?;
         let mut environment = Environment::new(&problem, &root.work_cell()?);
         let mut report = Report {

@@ -10,6 +10,7 @@ use std::collections::BTreeSet;
 use std::fmt::Write as _;
 use std::net::{IpAddr, Ipv4Addr};
 use std::path::PathBuf;
+use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
 
 /// The namespace in which the nodes are started: what is in it was named relatively.
@@ -24,11 +25,18 @@ pub struct Interfaces {
     /// Compare with this file instead of printing, and fail where it is not the same
     #[arg(long)]
     check: Option<PathBuf>,
+    /// What each node may do, for `ros2 security generate_artifacts`: config/sros2_policy.xml
+    #[arg(long)]
+    policy: bool,
 }
 
 impl Interfaces {
     pub fn run(self, root: &Root) -> Result<()> {
-        let page = page(root)?;
+        let page = if self.policy {
+            policy(&watch(root, true)?)
+        } else {
+            write_page(root, &watch(root, false)?)?
+        };
         let Some(path) = self.check else {
             print!("{page}");
             return Ok(());
@@ -37,9 +45,10 @@ impl Interfaces {
         for (number, (found, expected)) in file.lines().zip(page.lines()).enumerate() {
             if found != expected {
                 bail!(
-                    "{}:{}: {found:?}, expected {expected:?}; `sctn interfaces` makes it anew",
+                    "{}:{}: {found:?}, expected {expected:?}; `sctn interfaces{}` makes it anew",
                     path.display(),
-                    number + 1
+                    number + 1,
+                    if self.policy { " --policy" } else { "" }
                 );
             }
         }
@@ -159,15 +168,38 @@ fn qos_words(qos: &QosPolicies) -> String {
     .to_owned()
 }
 
+/// Nodes that run only beside a real cell, and who decides at a terminal.
+const BESIDE: [&str; 2] = ["motion_watchdog", "sctn_operate"];
+
+/// A node that lives until this is dropped.
+enum Running {
+    Composed(Context),
+    Process(Child),
+}
+
+impl Drop for Running {
+    fn drop(&mut self) {
+        match self {
+            Self::Composed(context) => context.shutdown(),
+            Self::Process(child) => {
+                // It may have ended by itself.
+                let _ = child.kill();
+                let _ = child.wait();
+            }
+        }
+    }
+}
+
 /// A node on a domain of its own, and somebody who looks at it.
 struct Watched {
     node: &'static str,
-    context: Context,
+    _running: Running,
     viewer: DomainParticipant,
 }
 
 impl Watched {
-    fn start(root: &Root, node: &'static str) -> Result<Self> {
+    /// With the parameters of a real cell, or as `config/` has them.
+    fn start(root: &Root, node: &'static str, real_cell: bool) -> Result<Self> {
         let path = |path: &str| root.join(path).display().to_string();
         let mut words = vec![
             "--ros-args".to_owned(),
@@ -179,10 +211,13 @@ impl Watched {
             "sim_workcell" => vec![("problems_dir", path("config/problems"))],
             "goal_oracle" => vec![("start_empty", "true".to_owned())],
             "operator_console" => vec![("port", "0".to_owned())],
-            "gctn_policy" => vec![(
-                "checkpoint",
-                root.shipped_checkpoint().display().to_string(),
-            )],
+            "gctn_policy" => vec![
+                (
+                    "checkpoint",
+                    root.shipped_checkpoint().display().to_string(),
+                ),
+                ("observation_needs_home", real_cell.to_string()),
+            ],
             _ => Vec::new(),
         };
         for (name, value) in given
@@ -191,10 +226,14 @@ impl Watched {
         {
             words.extend(["-p".to_owned(), format!("{name}:={value}")]);
         }
-        let (arguments, _) = RosArguments::parse(words)?;
         let network = Network::unused()?;
-        let context = Context::new(network);
-        graph::start(&context, node, &arguments)?;
+        let running = if BESIDE.contains(&node) {
+            Running::Process(process(node, &words, network)?)
+        } else {
+            let context = Context::new(network);
+            graph::start(&context, node, &RosArguments::parse(words)?.0)?;
+            Running::Composed(context)
+        };
         let viewer = DomainParticipantBuilder::new(network.domain_id)
             .with_only_networks([IpAddr::V4(Ipv4Addr::LOCALHOST)])
             .build()
@@ -203,7 +242,7 @@ impl Watched {
             })?;
         Ok(Self {
             node,
-            context,
+            _running: running,
             viewer,
         })
     }
@@ -243,14 +282,44 @@ impl Watched {
     }
 }
 
-fn page(root: &Root) -> Result<String> {
+/// One of [`BESIDE`], with ROS arguments as after the program's name.
+fn process(node: &str, words: &[String], network: Network) -> Result<Child> {
+    let own = std::env::current_exe().context("path of sctn")?;
+    let mut command = match node {
+        "sctn_operate" => {
+            let mut command = Command::new(own);
+            command.args(["operate", "--", "-r"]).arg(&words[2]);
+            command
+        }
+        node => {
+            let mut command = Command::new(own.with_file_name(node));
+            command.args(words);
+            command
+        }
+    };
+    command
+        .env("ROS_DOMAIN_ID", network.domain_id.to_string())
+        .env("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+        .env_remove("ROS_SECURITY_ENABLE")
+        .env("NODE_KIT_EXIT_WITH_PARENT", "1")
+        .stdin(Stdio::piped())
+        .stdout(Stdio::null())
+        .stderr(Stdio::null())
+        .spawn()
+        .with_context(|| format!("cannot start {:?}", command.get_program()))
+}
+
+/// Each node and what it has: those of the simulated cell, or those of a real one.
+fn watch(root: &Root, real_cell: bool) -> Result<Vec<(&'static str, BTreeSet<Endpoint>)>> {
     let runtime = tokio::runtime::Builder::new_multi_thread()
         .enable_all()
         .build()?;
     let _entered = runtime.enter();
+    let beside = BESIDE.iter().filter(|_| real_cell);
     let watched = NODES
         .iter()
-        .map(|node| Watched::start(root, node))
+        .chain(beside)
+        .map(|node| Watched::start(root, node, real_cell))
         .collect::<Result<Vec<_>>>()?;
     let begin = Instant::now();
     let mut seen: Vec<BTreeSet<Endpoint>> = vec![BTreeSet::new(); watched.len()];
@@ -273,13 +342,67 @@ fn page(root: &Root) -> Result<String> {
             changed = Instant::now();
         }
     }
-    for node in &watched {
-        node.context.shutdown();
-    }
-    let nodes: Vec<(&str, BTreeSet<Endpoint>)> =
-        watched.iter().map(|node| node.node).zip(seen).collect();
+    let nodes = watched.iter().map(|node| node.node).zip(seen).collect();
+    drop(watched);
     runtime.shutdown_timeout(Duration::from_millis(500));
-    write_page(root, &nodes)
+    Ok(nodes)
+}
+
+/// What each node may do, in the words of sros2.
+fn policy(nodes: &[(&str, BTreeSet<Endpoint>)]) -> String {
+    let mut text = String::from(
+        "<?xml version=\"1.0\" encoding=\"UTF-8\"?>\n\
+         <!-- What each node may do where ROS_SECURITY_ENABLE is true, for `ros2 security generate_artifacts` (docs/guide/security.md). Made by\n     \
+         `sctn interfaces` with its option `policy` from the running nodes; a test holds it current. Names follow the namespace `ns`: change\n     \
+         that where the cell has one, and topics where you remap them or the cameras and the driver have other names. -->\n\
+         <policy version=\"0.2.0\">\n  <enclaves>\n",
+    );
+    let cameras = nodes.iter().find(|(node, _)| *node == "camera_fusion");
+    for (node, endpoints) in nodes {
+        let mut endpoints = endpoints.clone();
+        // ros2-client reads it whatever the node's time is.
+        endpoints.insert(Endpoint {
+            role: Role::Subscribes,
+            name: "/clock".to_owned(),
+            type_name: "rosgraph_msgs/msg/Clock".to_owned(),
+            qos: "best effort".to_owned(),
+        });
+        if let (&"operator_console", Some((_, of_cameras))) = (node, cameras) {
+            // It asks for their images only while somebody looks at them.
+            let read = of_cameras
+                .iter()
+                .filter(|endpoint| endpoint.role == Role::Subscribes);
+            endpoints.extend(read.cloned());
+        }
+        text += &format!(
+            "    <enclave path=\"/sctn/{node}\">\n      <profiles>\n        <profile ns=\"/\" node=\"{node}\">\n"
+        );
+        for (role, _) in Role::ALL {
+            let (kind, right) = match role {
+                Role::Publishes => ("topic", "publish"),
+                Role::Subscribes => ("topic", "subscribe"),
+                Role::Serves => ("service", "reply"),
+                Role::Calls => ("service", "request"),
+                Role::CarriesOut => ("action", "execute"),
+                Role::Sends => ("action", "call"),
+            };
+            let names: BTreeSet<&str> = endpoints
+                .iter()
+                .filter(|endpoint| endpoint.role == role)
+                .map(|endpoint| endpoint.name.as_str())
+                .collect();
+            if names.is_empty() {
+                continue;
+            }
+            text += &format!("          <{kind}s {right}=\"ALLOW\">\n");
+            for name in names {
+                text += &format!("            <{kind}>{name}</{kind}>\n");
+            }
+            text += &format!("          </{kind}s>\n");
+        }
+        text += "        </profile>\n      </profiles>\n    </enclave>\n";
+    }
+    text + "  </enclaves>\n</policy>\n"
 }
 
 fn write_page(root: &Root, nodes: &[(&str, BTreeSet<Endpoint>)]) -> Result<String> {
@@ -403,6 +526,47 @@ mod tests {
         let qos = QosPolicyBuilder::new().best_effort().build();
         let endpoint = Endpoint::new("goal_oracle", topic, type_name, is_writer, &qos)?;
         Some((endpoint.role, endpoint.name, endpoint.type_name))
+    }
+
+    #[test]
+    fn a_policy_allows_what_nodes_have_and_no_more() {
+        let made = |role, name: &str| Endpoint {
+            role,
+            name: name.to_owned(),
+            type_name: "sctn_msgs/msg/Goal".to_owned(),
+            qos: String::new(),
+        };
+        let fusion = BTreeSet::from([made(Role::Subscribes, "front/color/image_raw")]);
+        let console = BTreeSet::from([
+            made(Role::Publishes, "step_confirmation"),
+            made(Role::Serves, "~/get_parameters"),
+            made(Role::Sends, "execute_pick_place"),
+        ]);
+        let text = policy(&[("camera_fusion", fusion), ("operator_console", console)]);
+        let (_, console) = text.split_once("/sctn/operator_console").unwrap();
+        let lines: Vec<&str> = console.lines().map(str::trim).collect();
+        for (right, name) in [
+            (
+                "<topics publish=\"ALLOW\">",
+                "<topic>step_confirmation</topic>",
+            ),
+            ("<topics subscribe=\"ALLOW\">", "<topic>/clock</topic>"),
+            (
+                "<services reply=\"ALLOW\">",
+                "<service>~/get_parameters</service>",
+            ),
+            (
+                "<actions call=\"ALLOW\">",
+                "<action>execute_pick_place</action>",
+            ),
+        ] {
+            let at = lines.iter().position(|line| *line == right);
+            assert_eq!(lines[at.expect(right) + 1], name);
+        }
+        // It looks at the cameras where somebody looks at it.
+        assert!(lines.contains(&"<topic>front/color/image_raw</topic>"));
+        let (fusion, _) = text.split_once("/sctn/operator_console").unwrap();
+        assert!(!fusion.contains("publish"), "{fusion}");
     }
 
     #[test]

@@ -28,10 +28,17 @@ pub struct Chain {
     proposals: Subscription<PickPlace>,
     goal: Goal,
     captures: u32,
+    /// Sets of images that a heightmap is the median of.
+    frames: u32,
 }
 
+/// Between the sets of a capture.
+const PERIOD: Duration = Duration::from_millis(33);
+/// By how much nearer everything is while something moves in front of the cameras.
+const NEARER: f32 = 0.9;
+
 impl Chain {
-    pub fn start(root: &Root, seed: u64) -> Result<Self> {
+    pub fn start(root: &Root, seed: u64, frames: u32) -> Result<Self> {
         let (problem, work_cell) = (root.problem("placing")?, root.work_cell()?);
         let mut environment = Environment::new(&problem, &work_cell);
         environment.reset(seed)?;
@@ -87,6 +94,8 @@ impl Chain {
             "--ros-args".to_owned(),
             "--params-file".into(),
             file("camera_fusion"),
+            "-p".into(),
+            format!("frames:={frames}"),
         ];
         context.start(
             "camera_fusion",
@@ -134,6 +143,7 @@ impl Chain {
             proposals: node.subscription("pick_place", Qos::Latched)?,
             goal,
             captures: 0,
+            frames,
             context,
             _node: node,
             runtime: {
@@ -155,7 +165,8 @@ impl Chain {
         bail!("camera_fusion and gctn_policy made no proposal within {PATIENCE:?}")
     }
 
-    /// Time from the last frame of a new capture to its proposal.
+    /// Time from the last frame of a new capture to its proposal. Where a heightmap is the median of several sets, something moves before, and
+    /// as many sets are sent as the median takes.
     pub fn measure(&mut self) -> Result<Duration> {
         self.capture(PATIENCE)
     }
@@ -165,11 +176,29 @@ impl Chain {
         let stamp = Duration::from_secs(u64::from(self.captures));
         self.goal.attempt = self.captures;
         self.goal.header = convert::header(stamp, "world")?;
-        let frames = self
-            .images
-            .iter()
-            .map(|(camera, image)| Frame::new(camera, image, stamp));
-        let frames = frames.collect::<Result<Vec<_>, _>>()?;
+        let moving = self.images.iter().map(|(camera, image)| {
+            let mut image = image.clone();
+            image.depth_m.iter_mut().for_each(|depth| *depth *= NEARER);
+            (camera.clone(), image)
+        });
+        let moving: Vec<_> = match self.frames {
+            1 => Vec::new(),
+            _ => moving.collect(),
+        };
+        let still = (0..self.frames).map(|_| &self.images);
+        let sets = (self.frames > 1)
+            .then_some(&moving)
+            .into_iter()
+            .chain(still);
+        let sets: Vec<_> = sets.collect();
+        let mut captured = Vec::new();
+        for (index, set) in sets.iter().enumerate() {
+            let before = PERIOD * (sets.len() - 1 - index) as u32;
+            let frames = set
+                .iter()
+                .map(|(camera, image)| Frame::new(camera, image, stamp - before));
+            captured.push(frames.collect::<Result<Vec<_>, _>>()?);
+        }
         let Self {
             runtime,
             cameras,
@@ -183,9 +212,15 @@ impl Chain {
             // The goal is there before the picture, as in a run.
             tokio::time::sleep(Duration::from_millis(30)).await;
             let mut start = Instant::now();
-            for (camera, frame) in cameras.iter().zip(frames) {
-                start = Instant::now();
-                camera.publish(frame);
+            let last = captured.len() - 1;
+            for (index, frames) in captured.into_iter().enumerate() {
+                for (camera, frame) in cameras.iter().zip(frames) {
+                    start = Instant::now();
+                    camera.publish(frame);
+                }
+                if index < last {
+                    tokio::time::sleep(PERIOD).await;
+                }
             }
             let sought = convert::time_to_msg(stamp)?;
             let proposal = async { while proposals.recv().await.header.stamp != sought {} };

@@ -23,6 +23,7 @@ mod latency;
 mod launch;
 mod operate;
 mod picture;
+mod policy;
 mod problems;
 mod progress;
 mod publish;

@@ -14,7 +14,11 @@ use node_kit::{
 use std::io::Write as _;
 use std::sync::Arc;
 use std::time::Duration;
-use step_protocol::{Operator, OperatorDecision, ProposalId, Question, StepOutcome};
+use step_protocol::{
+    Operator, OperatorDecision, PRESENCE_PERIOD, ProposalId, Question, RECOVERY_TIMEOUT,
+    StepOutcome,
+};
+use tokio::signal::unix;
 use tokio::sync::mpsc;
 use tokio::time::interval;
 
@@ -38,16 +42,14 @@ pub struct Operate {
     ros: Vec<String>,
 }
 
-/// How often the executor hears that somebody is at the terminal.
-const PRESENCE_PERIOD: Duration = Duration::from_millis(200);
 /// The executor plans and checks a way home.
 const HOME_TIMEOUT: CallOptions = CallOptions {
     attempts: 1,
-    timeout: Duration::from_secs(60),
+    timeout: RECOVERY_TIMEOUT,
 };
 /// A last decision takes so long to be sent.
 const LAST_WORD: Duration = Duration::from_millis(300);
-const HELP: &str = "at any time: [s]top, [h]ome, [q]uit";
+const HELP: &str = "at any time: [s]top, [h]ome, [p]ut down what is held, [r]etry the step that was broken off, [q]uit";
 
 impl Operate {
     pub fn run(self) -> Result<()> {
@@ -68,34 +70,38 @@ impl Operate {
         ];
         arguments.extend(self.ros.clone());
         let (context, node) = plain_node("sctn_operate", &arguments)?;
-        let mut desk = Desk::new(&node, &self)?;
+        let mut terminal = Terminal::new(&node, &self)?;
         println!("{HELP}");
         let mut lines = lines_of_terminal();
         let mut presence = interval(PRESENCE_PERIOD);
         let signal = wait_for_end();
         tokio::pin!(signal);
+        // Whoever closes the window of the terminal hangs up.
+        let mut hangup = unix::signal(unix::SignalKind::hangup()).context("SIGHUP")?;
         let ended = loop {
             tokio::select! {
                 line = lines.recv() => match line {
                     Some(line) if line.trim().eq_ignore_ascii_case("q") => break "ended by the operator",
-                    Some(line) => desk.on_line(&line)?,
+                    Some(line) => terminal.on_line(&line)?,
                     None => break "the terminal was closed",
                 },
+                _ = hangup.recv() => break "the terminal was closed",
                 result = &mut signal => {
                     result?;
                     break "ended by a signal";
                 }
-                _ = presence.tick() => desk.say_presence(true),
-                () = desk.listen() => {}
+                _ = presence.tick() => terminal.say_presence(true),
+                () = terminal.listen() => {}
             }
         };
         // Nobody is left to stop it.
-        if desk.moving.is_some() {
-            desk.decide(desk.subject(), OperatorDecision::Stop)?;
+        if terminal.moving.is_some() {
+            terminal.decide(terminal.subject(), OperatorDecision::Stop)?;
         }
-        desk.say_presence(false);
+        terminal.say_presence(false);
         tokio::time::sleep(LAST_WORD).await;
-        println!("{ended}");
+        // A closed terminal shows nothing.
+        let _ = writeln!(std::io::stdout(), "{ended}");
         context.shutdown();
         Ok(())
     }
@@ -147,11 +153,13 @@ impl Due {
 }
 
 /// What arrives, and what is decided.
-struct Desk {
+struct Terminal {
     node: Node,
     name: String,
     approve_only: bool,
     proposals: Subscription<PickPlace>,
+    /// Proposals that came as goals of the executor's action.
+    accepted: Subscription<PickPlace>,
     planned: Subscription<PlannedMotion>,
     results: Subscription<StepResult>,
     refused: Subscription<ConfirmationRefused>,
@@ -159,9 +167,10 @@ struct Desk {
     confirmations: Publisher<StepConfirmation>,
     presence: Publisher<OperatorPresence>,
     home: Arc<ServiceClient<ProposeHome>>,
-    /// Answers to calls for the way home.
-    home_sender: mpsc::UnboundedSender<Result<ProposeHomeResponse, String>>,
-    homes: mpsc::UnboundedReceiver<Result<ProposeHomeResponse, String>>,
+    put_down: Arc<ServiceClient<ProposeHome>>,
+    /// Answers to calls for the way home, and whether what is held is to be put down before.
+    home_sender: mpsc::UnboundedSender<(bool, Result<ProposeHomeResponse, String>)>,
+    homes: mpsc::UnboundedReceiver<(bool, Result<ProposeHomeResponse, String>)>,
     operator: Operator,
     step_count: u32,
     due: Option<Due>,
@@ -169,9 +178,11 @@ struct Desk {
     plan: Option<(ProposalId, String)>,
     /// The approved proposal whose result has not come yet.
     moving: Option<ProposalId>,
+    /// The proposal whose motion a stop or a fault has broken off: its step can be tried again.
+    broken_off: Option<ProposalId>,
 }
 
-impl Desk {
+impl Terminal {
     fn new(node: &Node, given: &Operate) -> Result<Self> {
         let user = || std::env::var("USER").ok().filter(|name| !name.is_empty());
         let (home_sender, homes) = mpsc::unbounded_channel();
@@ -184,6 +195,7 @@ impl Desk {
                 .unwrap_or_else(|| "sctn operate".into()),
             approve_only: given.approve_only,
             proposals: node.subscription("pick_place", Qos::Latched)?,
+            accepted: node.subscription("pick_place_goal", Qos::Event)?,
             planned: node.subscription("planned_motion", Qos::Latched)?,
             results: node.subscription("step_result", Qos::Event)?,
             refused: node.subscription("confirmation_refused", Qos::Event)?,
@@ -191,6 +203,9 @@ impl Desk {
             confirmations: node.publisher("step_confirmation", Qos::Event)?,
             presence: node.publisher("operator_presence", Qos::Event)?,
             home: Arc::new(node.service_client(&format!("{}/propose_home", given.executor))?),
+            put_down: Arc::new(
+                node.service_client(&format!("{}/propose_put_down", given.executor))?,
+            ),
             home_sender,
             homes,
             operator: Operator::new(false),
@@ -198,6 +213,7 @@ impl Desk {
             due: None,
             plan: None,
             moving: None,
+            broken_off: None,
         })
     }
 
@@ -208,6 +224,13 @@ impl Desk {
                 Ok(proposal) => self.operator.on_proposal(proposal),
                 Err(error) => {
                     self.proposals.reject(error);
+                    None
+                }
+            },
+            message = self.accepted.recv() => match convert::proposal_from_msg(&message) {
+                Ok(proposal) => self.operator.on_proposal(proposal),
+                Err(error) => {
+                    self.accepted.reject(error);
                     None
                 }
             },
@@ -224,8 +247,8 @@ impl Desk {
                 println!("refused: {}", refused.message);
                 None
             }
-            Some(answer) = self.homes.recv() => {
-                self.on_home(answer);
+            Some((puts_down, answer)) = self.homes.recv() => {
+                self.on_home(puts_down, answer);
                 None
             }
         };
@@ -299,15 +322,26 @@ impl Desk {
             result.outcome,
             StepOutcome::Fault | StepOutcome::Stopped | StepOutcome::NotHome
         ) {
-            println!("    the arm stands where it is: [h]ome proposes the way home");
+            println!(
+                "    the arm stands where it is: [h]ome proposes the way home, [p]ut down lowers what is held first, [r]etry tries the step again"
+            );
+        }
+        if result.arm_moved() && !result.outcome.is_of_home() {
+            let breaks_off = matches!(result.outcome, StepOutcome::Fault | StepOutcome::Stopped);
+            self.broken_off = breaks_off.then_some(result.proposal_id);
         }
         self.operator.on_result(result)
     }
 
-    fn on_home(&mut self, answer: Result<ProposeHomeResponse, String>) {
+    fn on_home(&mut self, puts_down: bool, answer: Result<ProposeHomeResponse, String>) {
         match answer {
             Ok(answer) if answer.success && answer.needs_approval => {
-                println!("the way home, slowly, straight up first");
+                match puts_down {
+                    true => {
+                        println!("what is held is put down where it was picked, then the way home")
+                    }
+                    false => println!("the way home, slowly, straight up first"),
+                }
                 self.due = Some(Due::Home(ProposalId(answer.proposal_id)));
                 self.prompt();
             }
@@ -325,16 +359,34 @@ impl Desk {
             self.due = None;
             return self.decide(subject, OperatorDecision::Stop);
         }
-        if key == "h" {
-            let (client, sender) = (Arc::clone(&self.home), self.home_sender.clone());
+        if key == "h" || key == "p" {
+            let puts_down = key == "p";
+            let client = Arc::clone(if puts_down {
+                &self.put_down
+            } else {
+                &self.home
+            });
+            let sender = self.home_sender.clone();
             tokio::spawn(async move {
                 let answer = client
                     .call(&ProposeHomeRequest::default(), &HOME_TIMEOUT)
                     .await;
                 // The session may be over.
-                let _ = sender.send(answer.map_err(|error| error.to_string()));
+                let _ = sender.send((puts_down, answer.map_err(|error| error.to_string())));
             });
             return Ok(());
+        }
+        if key == "r" {
+            return match self.broken_off.take() {
+                Some(id) => {
+                    println!("the step is tried again once its next proposal is approved");
+                    self.decide(id, OperatorDecision::Retry)
+                }
+                None => {
+                    println!("no step was broken off; {HELP}");
+                    Ok(())
+                }
+            };
         }
         let Some(due) = &self.due else {
             println!("nothing is to be decided; {HELP}");

@@ -1,6 +1,7 @@
 //! `sctn picture`: what the cameras, the fusion, the demonstrator and the policy make of a problem.
 
 use crate::demos::demonstration;
+use crate::policy::PolicyArguments;
 use crate::root::Root;
 use anyhow::{Context, Result};
 use clap::Args;
@@ -23,9 +24,8 @@ pub struct Picture {
     /// Step of the demonstration to draw, from 1
     #[arg(long, default_value_t = 1)]
     step: usize,
-    /// Checkpoint of the policy [default: the shipped one]
-    #[arg(long)]
-    checkpoint: Option<PathBuf>,
+    #[command(flatten)]
+    policy: PolicyArguments,
     /// Folder for the pictures
     #[arg(long)]
     out: PathBuf,
@@ -70,9 +70,8 @@ impl Picture {
         };
         write("heightmap.png", &both(&step.observation))?;
         write("goal.png", &both(image))?;
-        let checkpoint = self.checkpoint.unwrap_or_else(|| root.shipped_checkpoint());
         gctn::set_threads(1);
-        let policy = Policy::load(&checkpoint)?;
+        let policy = self.policy.load(root)?;
         let conditioning = policy.config().conditioning;
         let goal = goal(shown.observation(0), &goals, earned, conditioning);
         let goal = goal.context("a demonstration without a goal")?;

@@ -10,15 +10,30 @@ const DIMMED = 0.4;
 /** A block has a score worth seeing where one of red, green and blue differs from the dimmed heightmap by more. */
 const SCORED = 40;
 
-/** World position to pixel, through the lens (plumb_bob); nothing behind the camera. */
-function project({ pose, fx_px, fy_px, cx_px, cy_px, distortion: [k1, k2, p1, p2, k3] }, point) {
+/** Where a lens shows an ideal image point (x / z, y / z), by the models of sensor_msgs/CameraInfo. */
+function throughLens(model, d, u, v) {
+  const r2 = u * u + v * v;
+  if (model === "equidistant") {
+    const [k1, k2, k3, k4] = d;
+    const r = Math.sqrt(r2);
+    if (r < 1e-9) return [u, v];
+    const angle = Math.atan(r);
+    const a2 = angle * angle;
+    const scale = (angle * (1 + a2 * (k1 + a2 * (k2 + a2 * (k3 + a2 * k4))))) / r;
+    return [u * scale, v * scale];
+  }
+  const [k1, k2, p1, p2, k3, k4 = 0, k5 = 0, k6 = 0] = d;
+  const radial = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)));
+  return [u * radial + 2 * p1 * u * v + p2 * (r2 + 2 * u * u), v * radial + p1 * (r2 + 2 * v * v) + 2 * p2 * u * v];
+}
+
+/** World position to pixel, through the lens; nothing behind the camera. */
+function project({ pose, fx_px, fy_px, cx_px, cy_px, distortion_model, distortion }, point) {
   const to = point.map((value, axis) => value - pose[axis][3]);
   const [x, y, z] = [0, 1, 2].map((col) => pose[0][col] * to[0] + pose[1][col] * to[1] + pose[2][col] * to[2]);
   if (z <= 0.01) return null;
-  const [u, v] = [x / z, y / z];
-  const r2 = u * u + v * v;
-  const radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3));
-  return [fx_px * (u * radial + 2 * p1 * u * v + p2 * (r2 + 2 * u * u)) + cx_px, fy_px * (v * radial + p1 * (r2 + 2 * v * v) + 2 * p2 * u * v) + cy_px];
+  const [u, v] = throughLens(distortion_model, distortion, x / z, y / z);
+  return [fx_px * u + cx_px, fy_px * v + cy_px];
 }
 
 /** Height of the heightmap's cell under a position [m]. */

@@ -77,6 +77,17 @@ function need(which, number, load = () => api.heightmap(which)) {
   return null;
 }
 
+/** What brings the arm home, in words. */
+const RECOVERIES = {
+  home: { name: "The way home", go: "Go home this way", going: "The arm goes home.", shown: "This is the way home: it is played below." },
+  put_down: {
+    name: "Putting the part down",
+    go: "Put it down this way",
+    going: "The arm puts the part down and goes home.",
+    shown: "The part is put down where it was picked, and the arm goes home: it is played below.",
+  },
+};
+
 /** The first stream that has to be fresh and is not. */
 function silent() {
   return state?.streams.find((stream) => stream.required && stream.stale)?.name;
@@ -93,13 +104,13 @@ function obstacle(action) {
     const operator = state.viewers.find((viewer) => viewer.operator);
     return operator ? `${operator.name} decides. You are watching.` : "You are watching. Take control to decide.";
   }
-  if (action === "go-home") return state.motion?.proposal_id === state.home?.proposal_id ? undefined : "The way home is being planned.";
-  if (state.home && !state.home.approved && action === "approve") return "The way home is shown: decide on it first.";
-  if (state.lesson && !["home", "execute"].includes(action)) return "A lesson is being given. Save it or end it first.";
+  if (action === "go-home") return state.motion?.proposal_id === state.home?.proposal_id ? undefined : "The motion is being planned.";
+  if (state.home && !state.home.approved && action === "approve") return `${RECOVERIES[state.home.recovery].name} is shown: decide on it first.`;
+  if (state.lesson && !["home", "put-down", "execute"].includes(action)) return "A lesson is being given. Save it or end it first.";
   if (action === "teach") return state.phase === "moving" ? "The arm is moving." : undefined;
   if (action === "correct") return ["proposed", "awaiting_proposal"].includes(state.phase) ? undefined : "Nothing can be proposed now.";
   if (action === "execute" && silent()) return `${silent()} is stale: what you see may not be what is there.`;
-  if (action === "home") return state.phase === "moving" || state.lesson?.phase === "moving" ? "The arm is moving." : undefined;
+  if (action === "home" || action === "put-down") return state.phase === "moving" || state.lesson?.phase === "moving" ? "The arm is moving." : undefined;
   if (action === "continue") return state.phase === "stopped" ? undefined : "The run is not stopped.";
   const refused = state.refused[action];
   if (refused) return `${refused.reason} ${refused.advice}`;
@@ -118,6 +129,7 @@ async function act(action) {
   answer = "";
   // It is on its way before the page shows that it is.
   const asked = action === "home" ? api.post("home")
+    : action === "put-down" ? api.post("put_down")
     : action === "go-home" ? api.post("decisions", { proposal_id: state.home.proposal_id, decision: "approve" })
     : action === "teach" ? api.post("lesson/begin")
     : action === "continue" ? api.post("step", { step: state.goal.step })
@@ -550,7 +562,7 @@ function renderRole() {
 }
 
 function renderButtons() {
-  for (const action of [...DECISIONS, "correct", "home", "go-home", "continue", "teach", "execute"]) {
+  for (const action of [...DECISIONS, "correct", "home", "put-down", "go-home", "continue", "teach", "execute"]) {
     $(action).setAttribute("aria-disabled", String(Boolean(obstacle(action))));
   }
   const stopped = state?.phase === "stopped";
@@ -558,7 +570,8 @@ function renderButtons() {
   // What cannot be meant now is not offered.
   const lesson = Boolean(state?.lesson);
   const running = !judging && !stopped && !lesson;
-  const shown = { approve: running, reject: running, correct: running, advance: judging && !lesson, retry: judging && !lesson, continue: stopped && !lesson };
+  const holds = Boolean(state?.robot.vacuum) && state.phase !== "moving" && state.lesson?.phase !== "moving" && !state.home?.approved;
+  const shown = { "put-down": holds, approve: running, reject: running, correct: running, advance: judging && !lesson, retry: judging && !lesson, continue: stopped && !lesson };
   for (const [action, show] of Object.entries(shown)) {
     const button = $(action);
     if (!show && document.activeElement === button) $("headline").focus();
@@ -568,7 +581,11 @@ function renderButtons() {
   if ($("way-home").contains(document.activeElement) && (!home || home.approved)) $("headline").focus();
   $("way-home").hidden = !home;
   $("go-home").hidden = $("leave-home").hidden = !home || home.approved;
-  if (home) setText($("way-home-state"), home.approved ? "The arm goes home. Watch it; stop if anything is wrong." : "This is the way home: it is played below. Nothing moves before you approve it.");
+  if (home) {
+    const { go, going, shown } = RECOVERIES[home.recovery];
+    setText($("go-home-what"), go);
+    setText($("way-home-state"), home.approved ? `${going} Watch it; stop if anything is wrong.` : `${shown} Nothing moves before you approve it.`);
+  }
   const main = lesson ? "execute" : judging ? "advance" : stopped ? "continue" : "approve";
   setText($("why"), answer || (lesson && isOperator() && state.lesson.phase !== "previewing" ? "" : obstacle(main)) || "");
   const stale = link !== "up" || Boolean(silent()) || (state?.phase === "proposed" && state.stale);
@@ -697,12 +714,13 @@ function renderMotion() {
 const cameras = new CameraViews(api, $("cameras"), $("camera-list"));
 
 /** Who made a proposal, and how sure of it; a person's corrections have no scores. */
-function whose({ author, checkpoint, pick_score, place_score, success_probability }) {
+function whose({ author, checkpoint, pick_score, place_score, success_probability, verdict }) {
   const percent = (share) => `${Math.round(100 * share)} %`;
   if (!checkpoint && author) return ` Made by ${author}.`;
   const by = author ? ` Made by ${author}${checkpoint ? ` with ${checkpoint}` : ""}.` : "";
   const success = success_probability == null ? "" : ` It expects the step to succeed with ${percent(success_probability)}.`;
-  return `${by} Its scores: pick ${percent(pick_score)}, place ${percent(place_score)}.${success}`;
+  const doubt = verdict ? ` Look closely: ${verdict}.` : "";
+  return `${by} Its scores: pick ${percent(pick_score)}, place ${percent(place_score)}.${success}${doubt}`;
 }
 
 /** A small picture in a list, with its caption. */
@@ -835,7 +853,7 @@ function renderRest() {
   renderSteps();
 }
 
-for (const action of [...DECISIONS, "correct", "home", "go-home", "continue", "teach"]) $(action).addEventListener("click", () => act(action));
+for (const action of [...DECISIONS, "correct", "home", "put-down", "go-home", "continue", "teach"]) $(action).addEventListener("click", () => act(action));
 for (const radio of document.querySelectorAll("input[name=mode]")) radio.addEventListener("change", render);
 
 const KEYS = new Map([...document.querySelectorAll("[aria-keyshortcuts]")].map((button) => [button.getAttribute("aria-keyshortcuts"), button.id]));

@@ -5,7 +5,7 @@ use std::collections::BTreeMap;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
 
-use heightmap::{Distortion, Intrinsics, TransformError, Transforms};
+use heightmap::{Intrinsics, TransformError, Transforms};
 use nalgebra::Isometry3;
 use serde::Serialize;
 
@@ -49,9 +49,11 @@ pub struct CameraState {
     fy_px: f64,
     cx_px: f64,
     cy_px: f64,
-    /// Lens after plumb_bob: k1, k2, p1, p2, k3.
-    distortion: [f64; 5],
-    /// Pose of the optical frame in the world, row by row: rotation and translation (m); nothing where it is not known.
+    /// Model of the lens, as in `CameraInfo`.
+    distortion_model: &'static str,
+    /// Its coefficients, in the order of `CameraInfo.d`.
+    distortion: Vec<f64>,
+    /// Pose of the optical frame in the world, row by row: rotation and translation (m); `None` where it is not known.
     pose: Option<[[f64; 4]; 3]>,
 }
 
@@ -91,7 +93,7 @@ impl Cameras {
                 fy_px,
                 cx_px,
                 cy_px,
-                distortion: Distortion { k1, k2, p1, p2, k3 },
+                distortion,
             } = seen.intrinsics?;
             let pose = state.transforms.world_from(&seen.frame, &self.world_frame);
             let pose = pose.ok().map(|pose| {
@@ -107,7 +109,8 @@ impl Cameras {
                 fy_px,
                 cx_px,
                 cy_px,
-                distortion: [k1, k2, p1, p2, k3],
+                distortion_model: distortion.model(),
+                distortion: distortion.coefficients(),
                 pose,
             })
         };

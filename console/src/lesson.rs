@@ -232,7 +232,7 @@ impl Lesson {
         self.trial.take_if(|trial| trial.ended.is_none());
     }
 
-    /// Step number and attempt of the motion that waits, if it is proposed again; nothing where that was done too often.
+    /// Step number and attempt of the motion that waits, if it is proposed again; `None` where that was done too often.
     pub fn next_renewal(&self) -> Option<(u32, u32)> {
         let trial = self.trial.as_ref()?;
         (trial.renewals < MOST_RENEWALS).then(|| self.next())

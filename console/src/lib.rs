@@ -6,19 +6,22 @@
 //!
 //! ```
 //! use std::time::Duration;
-//! use console::{Phase, Run, Watch};
+//! use console::{Run, Watch};
+//! use step_protocol::RunPhase;
 //!
 //! let run = Run::new(Watch {
 //!     nodes: vec!["/suction_executor".into()],
 //!     executor: "/suction_executor".into(),
+//!     image_topics: vec!["color/image_raw".into(), "depth/image_rect_raw".into()],
 //!     stale_after: Duration::from_secs(3),
 //!     changes: heightmap::ChangeRules::default(),
 //! });
-//! assert_eq!(run.phase(), Phase::NoGoal);
+//! assert_eq!(run.phase(), RunPhase::NoGoal);
 //! ```
 
 mod cameras;
 mod checkpoints;
+mod files;
 mod history;
 mod lesson;
 mod library;
@@ -39,11 +42,11 @@ pub use history::{History, RunCount, RunEvent};
 pub use library::{Entry, Libraries, Library};
 pub use listener::{Listener, Stream, TlsError, tls_acceptor};
 pub use preview::{InvalidPlan, Motion, Plan, Point, ScoreMaps};
-pub use refusal::{Refusal, advice};
-pub use run::{Decision, InvalidMessage, NodeReport, Phase, Pose, Run, View, Watch};
-pub use server::{Access, Page, router};
+pub use refusal::Refusal;
+pub use run::{Decision, InvalidMessage, NodeReport, Pose, Run, View, Watch};
+pub use server::{Access, InvalidToken, Page, router};
 pub use session::{Sessions, ViewerId};
-pub use state::{Command, Console, PolicyState, State};
+pub use state::{Answer, Command, Console, PolicyState, State};
 pub use tokio_rustls::TlsAcceptor;
 pub use training::Trainings;
 

@@ -109,7 +109,7 @@ impl Library {
         self.path(name).is_ok_and(|path| path.is_dir())
     }
 
-    /// All demonstrations, newest first. What is in the folder and is none is left out. Reads files.
+    /// All demonstrations, newest first. Entries of the folder that are no demonstrations are skipped. Reads files.
     pub fn list(&self) -> Vec<Entry> {
         let mut known = self.known.lock().unwrap_or_else(PoisonError::into_inner);
         let Ok(folders) = std::fs::read_dir(&self.folder) else {
@@ -186,7 +186,7 @@ impl Library {
 /// Checks that a name can be that of a demonstration's folder.
 ///
 /// # Errors
-/// When it is none.
+/// The name is empty, too long, or has characters other than those allowed.
 pub fn check_folder_name(name: &str) -> Result<(), Refusal> {
     lesson::check_name_up_to(name, LONGEST_NAME)
 }

@@ -31,7 +31,7 @@ pub enum TlsError {
     Certificate {
         /// Its file.
         path: PathBuf,
-        /// Why.
+        /// The reason.
         source: pem::Error,
     },
     /// No private key.
@@ -39,7 +39,7 @@ pub enum TlsError {
     Key {
         /// Its file.
         path: PathBuf,
-        /// Why.
+        /// The reason.
         source: pem::Error,
     },
     /// The key is not that of the certificate.

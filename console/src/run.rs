@@ -1,6 +1,5 @@
 //! The run as the operator sees it: messages in, a snapshot out. No clock, no node.
 
-mod answer;
 mod correction;
 mod decide;
 mod health;
@@ -16,14 +15,15 @@ use std::time::Duration;
 use heightmap::{ChangeRules, Heightmap};
 use nalgebra::Point2;
 use serde::Serialize;
-use step_protocol::{Coverage, Goal, Observation, Proposal, ProposalId, Reward, StepOutcome};
+use step_protocol::{
+    Coverage, Goal, Observation, Operator, Proposal, ProposalId, Reward, RunPhase, StepOutcome,
+};
 
-use self::answer::Unanswered;
 use self::health::{NodeHealth, Robot};
-use self::view::TableChange;
+use self::view::Compared;
 use crate::preview::{Motion, ScoreMaps};
 
-pub use self::decide::{Decision, Phase};
+pub use self::decide::Decision;
 pub use self::health::NodeReport;
 pub(crate) use self::outcome::outcome_words;
 pub use self::propose::Pose;
@@ -34,37 +34,10 @@ pub use self::view::View;
 const STEPS: usize = 64;
 /// Refusals and faults that are shown.
 const NOTICES: usize = 50;
-/// Proposals whose status is remembered: one may be published again.
-const PROPOSALS: usize = 256;
 /// Heightmaps of which the proposals may still come, and planned motions of which they may.
 const HEIGHTMAPS: usize = 8;
 /// Longest description of a robot that is taken (bytes).
 const LONGEST_DESCRIPTION: usize = 1 << 20;
-
-/// What became of a proposal.
-#[derive(Clone, Debug, PartialEq)]
-enum Status {
-    Open,
-    Approved,
-    /// It was rejected, withdrawn or superseded: it can never be approved again.
-    Closed,
-    /// Carried out.
-    Moved {
-        fault: bool,
-    },
-    /// Carried out, and the operator has said whether it succeeded.
-    Confirmed {
-        fault: bool,
-    },
-}
-
-#[derive(Debug)]
-struct Offered {
-    proposal: Proposal,
-    status: Status,
-    /// What has changed on the table since the heightmap that it was made from; nothing where that one is not known.
-    change: Option<TableChange>,
-}
 
 /// A step that was carried out.
 #[derive(Debug)]
@@ -101,6 +74,8 @@ pub struct Watch {
     pub nodes: Vec<String>,
     /// Full name of the executor, one of them.
     pub executor: String,
+    /// Endings of the topics of the cameras' images.
+    pub image_topics: Vec<String>,
     /// Age from which a stream is stale.
     pub stale_after: Duration,
     /// A proposal is stale when the table has changed by these since the heightmap that it was made from.
@@ -111,19 +86,20 @@ pub struct Watch {
 #[derive(Debug)]
 pub struct Run {
     watch: Watch,
+    /// How far the run is, and what has to be decided.
+    operator: Operator,
     views: VecDeque<View>,
     view_count: u64,
-    goal: Option<Goal>,
     goal_view: Option<View>,
     goal_count: u64,
     /// Goals of the present demonstration that were latched, by step.
     strip: BTreeMap<u32, View>,
     /// A demonstration that was read: its name, and the goal images of its steps.
     demonstration: Option<(String, Vec<View>)>,
-    offered: VecDeque<Offered>,
-    /// Id of the newest proposal.
-    newest: Option<ProposalId>,
-    stopped: bool,
+    /// How the table differs from what the present proposal was made from.
+    compared: Option<Compared>,
+    /// The proposal whose rejection the console has repeated by itself: its refusal is no news for a person.
+    probed: Option<ProposalId>,
     steps: VecDeque<PastStep>,
     step_count: u64,
     notices: VecDeque<Notice>,
@@ -131,11 +107,8 @@ pub struct Run {
     health: BTreeMap<String, NodeHealth>,
     robot: Robot,
     joints: Option<(Duration, Vec<String>, Vec<f64>)>,
-    reward: Option<Reward>,
     /// The newest planned motions, one for each proposal.
     motions: VecDeque<Motion>,
-    /// The newest decision that nothing has come of yet.
-    unanswered: Option<Unanswered>,
     /// The newest score maps.
     scores: Option<Arc<ScoreMaps>>,
     score_count: u64,
@@ -177,16 +150,15 @@ impl Run {
     pub fn new(watch: Watch) -> Self {
         Self {
             watch,
+            operator: Operator::new(false),
             views: VecDeque::new(),
             view_count: 0,
-            goal: None,
             goal_view: None,
             goal_count: 0,
             strip: BTreeMap::new(),
             demonstration: None,
-            offered: VecDeque::new(),
-            newest: None,
-            stopped: false,
+            compared: None,
+            probed: None,
             steps: VecDeque::new(),
             step_count: 0,
             notices: VecDeque::new(),
@@ -194,9 +166,7 @@ impl Run {
             health: BTreeMap::new(),
             robot: Robot::default(),
             joints: None,
-            reward: None,
             motions: VecDeque::new(),
-            unanswered: None,
             scores: None,
             score_count: 0,
             robot_description: None,
@@ -231,10 +201,10 @@ impl Run {
             return Err(InvalidMessage::Step { step, step_count });
         }
         // The same one, latched again.
-        if self.goal.as_ref() == Some(&goal) {
+        if self.goal() == Some(&goal) {
             return Ok(());
         }
-        if self.goal.as_ref().is_none_or(|known| {
+        if self.goal().is_none_or(|known| {
             known.demonstration != goal.demonstration || known.step_count != step_count
         }) {
             self.strip.clear();
@@ -249,9 +219,8 @@ impl Run {
         );
         self.strip.insert(step, view.clone());
         self.goal_view = Some(view);
-        self.goal = Some(goal);
-        self.stopped = false;
-        self.unanswered = None;
+        self.operator.on_goal(&goal);
+        self.compare();
         Ok(())
     }
 
@@ -273,29 +242,14 @@ impl Run {
                 });
             }
         }
-        let id = proposal.id;
-        if let Some(known) = self.offered(id) {
-            if known.status != Status::Closed {
-                self.newest = Some(id);
-            }
-            return Ok(());
-        }
-        self.newest = Some(id);
-        if self.offered.len() == PROPOSALS {
-            self.offered.pop_front();
-        }
-        self.offered.push_back(Offered {
-            proposal,
-            status: Status::Open,
-            change: None,
-        });
+        self.operator.on_proposal(proposal);
         self.compare();
         Ok(())
     }
 
     /// The simulator has measured.
     pub fn on_reward(&mut self, reward: Reward) {
-        self.reward = Some(reward);
+        self.operator.on_reward(reward);
     }
 
     /// The executor has planned the motion of a proposal.
@@ -345,7 +299,7 @@ impl Run {
 
     /// The scores of the heightmap that the present proposal was made from, and their number.
     pub fn scores(&self) -> Option<(u64, &Arc<ScoreMaps>)> {
-        let stamp = self.current()?.proposal.stamp;
+        let stamp = self.current()?.stamp;
         let scores = self
             .scores
             .as_ref()
@@ -376,47 +330,26 @@ impl Run {
 
     /// A proposal that has come, by its id.
     pub fn proposal(&self, id: ProposalId) -> Option<&Proposal> {
-        let mut offered = self.offered.iter();
-        let found = offered.rfind(|known| known.proposal.id == id);
-        found.map(|known| &known.proposal)
+        self.operator.proposal(id)
     }
 
-    fn offered(&mut self, id: ProposalId) -> Option<&mut Offered> {
-        self.offered
-            .iter_mut()
-            .rfind(|known| known.proposal.id == id)
+    /// How far the run is.
+    pub fn phase(&self) -> RunPhase {
+        self.operator.phase()
     }
 
-    /// The proposal for the present goal that the arm moves or has moved for; else the newest, if it is for this goal.
-    fn current(&self) -> Option<&Offered> {
-        let goal = self.goal.as_ref()?;
-        // A demonstration that is repeated has the same steps again: what was seen before its goal is of the time before.
-        let of_this_goal = |known: &&Offered| {
-            let Proposal {
-                step,
-                attempt,
-                problem,
-                stamp,
-                ..
-            } = &known.proposal;
-            (*step, *attempt, problem) == (goal.step, goal.attempt, &goal.problem)
-                && *stamp >= goal.stamp
-        };
-        let offered = || self.offered.iter().rev().filter(of_this_goal);
-        let at_work = |known: &&Offered| !matches!(known.status, Status::Open | Status::Closed);
-        offered()
-            .find(at_work)
-            .or_else(|| offered().find(|known| Some(known.proposal.id) == self.newest))
+    fn current(&self) -> Option<&Proposal> {
+        self.operator.current()
     }
 
     /// Id of the proposal that a decision would be about.
     pub fn current_id(&self) -> Option<ProposalId> {
-        self.current().map(|offered| offered.proposal.id)
+        self.current().map(|proposal| proposal.id)
     }
 
     /// The present goal.
     pub fn goal(&self) -> Option<&Goal> {
-        self.goal.as_ref()
+        self.operator.goal()
     }
 
     /// The newest heightmap.
@@ -443,7 +376,7 @@ impl Run {
     /// The goal image of a step of the present demonstration, where it is known.
     pub fn strip(&self, step: u32) -> Option<&View> {
         self.strip.get(&step).or_else(|| {
-            let goal = self.goal.as_ref()?;
+            let goal = self.goal()?;
             let (name, images) = self.demonstration.as_ref()?;
             let same = *name == goal.demonstration && images.len() == goal.step_count as usize;
             images.get(step.checked_sub(1)? as usize).filter(|_| same)

@@ -15,6 +15,7 @@ pub(crate) fn watch(nodes: &[&str]) -> Watch {
     Watch {
         nodes: nodes.iter().map(|&node| node.to_owned()).collect(),
         executor: "/suction_executor".into(),
+        image_topics: vec!["color/image_raw".into(), "depth/depth_registered".into()],
         stale_after: Duration::from_secs(3),
         changes: ChangeRules::default(),
     }
@@ -88,6 +89,7 @@ pub(crate) fn proposal(id: u64) -> Proposal {
         pick_score: 0.5,
         place_score: 0.5,
         success_probability: None,
+        done_probability: None,
         checkpoint: String::new(),
         author: String::new(),
     }

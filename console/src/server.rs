@@ -30,7 +30,7 @@ use crate::library::Libraries;
 use crate::state::Console;
 use crate::training::Trainings;
 
-pub use self::access::Access;
+pub use self::access::{Access, InvalidToken};
 
 /// Largest body of a request [bytes].
 const LARGEST_BODY: usize = 16 * 1024;
@@ -132,6 +132,7 @@ pub fn router(page: Page, access: Access, end: CancellationToken) -> Router {
         .route("/decisions", post(decisions::decide))
         .route("/proposals", post(decisions::correct))
         .route("/home", post(decisions::home))
+        .route("/put_down", post(decisions::put_down))
         .route("/step", post(decisions::set_step))
         .route("/heightmaps/{which}", get(pictures::heightmap))
         .route("/cameras", get(pictures::list_cameras))
@@ -235,4 +236,4 @@ async fn off_thread<T: Send + 'static>(
 }
 
 #[cfg(test)]
-mod tests;
+pub(crate) mod tests;

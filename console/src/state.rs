@@ -1,10 +1,10 @@
 //! What HTTP handlers and the node share: the run, the people, and what is to be said to the graph.
 
+mod answers;
 mod home;
 mod learn;
 mod teach;
 
-use std::collections::VecDeque;
 use std::path::PathBuf;
 use std::sync::{Mutex, MutexGuard, PoisonError};
 use std::time::{Duration, Instant};
@@ -12,10 +12,12 @@ use std::time::{Duration, Instant};
 use bags::Demonstration;
 use serde::Serialize;
 use step_protocol::{
-    Confirmation, Observation, OperatorDecision, Proposal, ProposalId, StepOutcome, StepResult,
+    Confirmation, Observation, OperatorDecision, Proposal, ProposalId, Recovery, RunPhase,
+    StepOutcome, StepResult,
 };
 use tokio::sync::{mpsc, watch};
 
+pub use self::answers::Answer;
 use self::home::Home;
 use self::learn::Repetition;
 use self::teach::Planning;
@@ -23,12 +25,12 @@ use crate::history::RunEvent;
 use crate::lesson::{Lesson, LessonState};
 use crate::preview::Motion;
 use crate::refusal::Refusal;
-use crate::run::{Decision, InvalidMessage, MotionState, Phase, Pose, Run, Snapshot};
+use crate::run::{Decision, InvalidMessage, MotionState, Pose, Run, Snapshot};
 use crate::session::{Sessions, ViewerId, ViewerState};
 use crate::training::TrainingState;
 
-/// Confirmations of ours that have not come back on the topic yet.
-const SENT: usize = 64;
+/// Who decides where the console itself says something that no person has said.
+const BY_ITSELF: &str = "operator_console";
 
 /// What the node is to do.
 #[derive(Clone, Debug, PartialEq)]
@@ -39,8 +41,8 @@ pub enum Command {
     Presence,
     /// Publish this proposal of the operator's.
     Propose(Box<Proposal>),
-    /// Have the executor propose the way home; for whom.
-    Home(String),
+    /// Have the executor propose the way home, or to put down what is held before; for whom.
+    Recover(Recovery, String),
     /// Have the oracle latch this step again; for whom.
     SetStep(u32, String),
     /// Have the oracle load the demonstration of this name in the library, at this path; for whom.
@@ -63,7 +65,7 @@ pub struct State {
     lesson: Option<Lesson>,
     /// The motion of the lesson that the executor has not planned yet.
     planning: Option<Planning>,
-    /// The way home that the executor has proposed.
+    /// The way home, or the putting down, that the executor has proposed.
     home: Option<Home>,
     /// The demonstration of the library that is repeated.
     repetition: Option<Repetition>,
@@ -71,8 +73,6 @@ pub struct State {
     library_version: u64,
     /// The policy's checkpoint, once it was changed.
     pub policy: Option<PolicyState>,
-    /// Proposal and decision of our own confirmations: what they change was changed when they were made.
-    sent: VecDeque<(ProposalId, OperatorDecision)>,
     commands: Option<mpsc::UnboundedSender<Command>>,
 }
 
@@ -123,7 +123,6 @@ impl Console {
                 repetition: None,
                 library_version: 0,
                 policy: None,
-                sent: VecDeque::new(),
                 commands: None,
             }),
             version: watch::Sender::new(0),
@@ -164,6 +163,13 @@ impl Console {
         let result = self.change_quietly(change);
         self.version.send_modify(|version| *version += 1);
         result
+    }
+
+    /// Takes in what was heard; viewers are told where it returns true.
+    pub fn hear(&self, change: impl FnOnce(&mut State, Duration) -> bool) {
+        if self.change_quietly(change) {
+            self.version.send_modify(|version| *version += 1);
+        }
     }
 
     /// Counts the changes.
@@ -254,16 +260,12 @@ impl State {
             operator_name,
         };
         self.send(Command::Confirm(confirmation.clone()))?;
-        self.heard_confirmation(&confirmation, now);
-        if self.sent.len() == SENT {
-            self.sent.pop_front();
-        }
-        self.sent.push_back((proposal_id, decision));
+        self.run.decide(&confirmation, now);
+        self.after_decision(&confirmation);
         Ok(())
     }
 
-    fn heard_confirmation(&mut self, confirmation: &Confirmation, now: Duration) {
-        self.run.on_confirmation(confirmation, now);
+    fn after_decision(&mut self, confirmation: &Confirmation) {
         // The executor withdraws the way home at a stop and at any other motion.
         self.home.take_if(|home| match confirmation.decision {
             OperatorDecision::Stop => true,
@@ -279,7 +281,7 @@ impl State {
             home.proposal_id
         } else if let Some(lesson) = &self.lesson {
             lesson.pending()?.id
-        } else if self.run.phase() == Phase::Proposed {
+        } else if self.run.phase() == RunPhase::Proposed {
             self.run.current_id()?
         } else {
             return None;
@@ -323,7 +325,7 @@ impl State {
     pub fn on_result(&mut self, result: &StepResult, now: Duration) {
         let id = result.proposal_id;
         let by_itself =
-            result.outcome == StepOutcome::Stopped && self.run.phase() != Phase::Stopped;
+            result.outcome == StepOutcome::Stopped && self.run.phase() != RunPhase::Stopped;
         self.run.on_result(result, now);
         let is_of_home = result.outcome.is_of_home();
         self.home
@@ -331,11 +333,10 @@ impl State {
         if result.outcome.motion().is_some() {
             self.count_run(id);
         }
-        if by_itself && self.lesson.is_none() && self.run.phase() == Phase::Stopped {
+        if by_itself && self.lesson.is_none() && self.run.phase() == RunPhase::Stopped {
             // The executor has stopped by itself, for instance because the operator was gone: everybody has to know that the run
             // is stopped, or it cannot be continued. While the console is inactive there is nobody to tell.
-            let name = "operator_console".to_owned();
-            let _ = self.confirm(id, OperatorDecision::Stop, name, now);
+            let _ = self.confirm(id, OperatorDecision::Stop, BY_ITSELF.to_owned(), now);
         }
         if let Some(lesson) = &mut self.lesson {
             lesson.on_result(result);
@@ -358,7 +359,7 @@ impl State {
     ) -> Result<(), Refusal> {
         self.sessions.check_operator(viewer)?;
         self.check_no_lesson()?;
-        if self.run.phase() == Phase::Moving {
+        if self.run.phase() == RunPhase::Moving {
             return Err(Refusal::new("The arm is moving.", "Wait until it is back."));
         }
         let name = self.sessions.name(viewer).to_owned();
@@ -430,21 +431,29 @@ impl State {
     /// Asks again what was not heard. Returns whether anything was not.
     pub fn ask_again(&mut self, now: Duration) -> bool {
         let is_unplanned = self.give_planning_up(now);
-        let is_unanswered = self.run.ask_again(now);
-        if is_unanswered && let Some(lesson) = &mut self.lesson {
-            lesson.forget_motion();
+        let unanswered = self.run.ask_again(now);
+        if let Some(id) = unanswered {
+            if let Some(lesson) = &mut self.lesson {
+                lesson.forget_motion();
+            }
+            // It is shown for approval again.
+            if let Some(home) = self.home.as_mut().filter(|home| home.proposal_id == id) {
+                home.approved = false;
+            }
         }
-        is_unplanned || is_unanswered
+        // What lets things go on was lost: see `Operator::probe`. A console without an operator decides nothing.
+        let is_operated = self.sessions.operator().is_some() && self.lesson.is_none();
+        if is_operated && let Some(id) = self.run.probe(now) {
+            // While the console is inactive there is nobody to tell.
+            let _ = self.confirm(id, OperatorDecision::Reject, BY_ITSELF.to_owned(), now);
+        }
+        is_unplanned || unanswered.is_some()
     }
 
     /// A confirmation has come on the topic; one of ours is known already.
     pub fn on_confirmation(&mut self, confirmation: &Confirmation, now: Duration) {
-        let key = (confirmation.proposal_id, confirmation.decision);
-        match self.sent.iter().position(|sent| *sent == key) {
-            Some(index) => {
-                self.sent.remove(index);
-            }
-            None => self.heard_confirmation(confirmation, now),
+        if self.run.on_confirmation(confirmation, now) {
+            self.after_decision(confirmation);
         }
     }
 

@@ -37,7 +37,7 @@ enum TrainingError {
         status: ExitStatus,
         words: String,
     },
-    #[error("sctn compare has said nothing")]
+    #[error("sctn compare printed no report")]
     NoReport,
     #[error("the report of sctn compare: {0}")]
     Report(#[from] serde_json::Error),

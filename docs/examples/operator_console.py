@@ -53,6 +53,22 @@ class Console:
         """`approve`, `reject`, `advance`, `retry` or `stop`."""
         self.post("decisions", decision=decision, proposal_id=proposal["id"] if proposal else "0")
 
+    def recover(self, how: str) -> dict[str, Any]:
+        """Has the executor plan how the arm comes home: `home`, or `put_down` what is held first. Returns `home` of the state."""
+        self.post(how)
+        end = time.monotonic() + 60.0
+        while time.monotonic() < end:
+            state = self.state()
+            home, motion = state["home"], state["motion"]
+            if home and home["recovery"] == how and motion and motion["proposal_id"] == home["proposal_id"]:
+                return home
+            time.sleep(0.05)
+        raise TimeoutError(f"{how} was not proposed: {state['notices'][-1:]}")
+
+    def decide_recovery(self, decision: str, home: dict[str, Any]) -> None:
+        """`approve` or `reject` what `recover` has returned."""
+        self.post("decisions", decision=decision, proposal_id=home["proposal_id"])
+
     def heightmap(self, which: str) -> tuple[int, int, bytes, list[float]]:
         """Rows, columns, colours (3 bytes for each cell) and heights [m] of `present`, `goal`, `goal-2` and so on."""
         body, headers = self._request(f"heightmaps/{which}")

@@ -121,7 +121,7 @@ pub enum DataSetError {
     Io {
         /// The folder.
         path: PathBuf,
-        /// Why.
+        /// The reason.
         source: std::io::Error,
     },
     /// Fewer demonstrations than asked for.

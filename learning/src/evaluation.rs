@@ -71,7 +71,7 @@ pub struct EpisodeReport {
 /// A network's judgements of one step, and the step's result.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 pub struct SaidStep {
-    /// What it said.
+    /// The estimates before the step.
     pub said: Said,
     /// Whether the step earned a reward.
     pub earned: bool,
@@ -126,7 +126,7 @@ pub enum EvaluationError {
     Environment {
         /// Seed of the episode.
         seed: u64,
-        /// Why.
+        /// The reason.
         source: Box<EnvironmentError>,
     },
     /// The folder of shown demonstrations.
@@ -137,7 +137,7 @@ pub enum EvaluationError {
     Policy {
         /// Seed of the episode.
         seed: u64,
-        /// Why.
+        /// The reason.
         source: gctn::Error,
     },
 }

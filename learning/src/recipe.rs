@@ -127,7 +127,7 @@ pub enum RecipeError {
     Io {
         /// The file.
         path: PathBuf,
-        /// Why.
+        /// The reason.
         source: std::io::Error,
     },
     /// Not YAML, an unknown field, or a field of another type.
@@ -159,7 +159,7 @@ pub enum RecipeError {
     Field {
         /// The file.
         path: PathBuf,
-        /// Which.
+        /// The field.
         field: String,
         /// Its value.
         value: String,

@@ -26,7 +26,7 @@ pub enum ShownError {
     Io {
         /// The file or folder.
         path: PathBuf,
-        /// Why.
+        /// The reason.
         source: std::io::Error,
     },
     /// A bag cannot be written or read.

@@ -120,7 +120,7 @@ pub enum TrainingError {
     Io {
         /// The file or folder.
         path: PathBuf,
-        /// Why.
+        /// The reason.
         source: std::io::Error,
     },
     /// The network, its optimiser or a checkpoint.

@@ -30,7 +30,7 @@ pub fn type_hash(
     hash
 }
 
-/// Hashes of the structure as it was before its last fields were added: one for every number of them that may be missing.
+/// Type hashes of earlier versions of a message, which lack its last fields: one for every number of fields that may be missing.
 pub fn earlier_type_hashes(
     known: &BTreeMap<(String, String), Interface>,
     interface: &Interface,

@@ -6,6 +6,7 @@
 //! `-Result` and `-Feedback`.
 
 pub mod bounded;
+mod camera_topics;
 mod cdr;
 pub mod convert;
 mod interface;
@@ -14,6 +15,7 @@ mod interfaces {
     include!(concat!(env!("OUT_DIR"), "/interfaces.rs"));
 }
 
+pub use camera_topics::{CameraPreset, CameraTopicNames, UnknownPreset};
 pub use cdr::{CdrError, from_cdr, from_recorded_cdr, to_cdr, to_cdr_in};
 pub use interface::{
     Action, Description, Interface, Service, Visitor, description, message_type_name,

@@ -21,6 +21,8 @@ def generate_launch_description() -> LaunchDescription:
         return Node(
             package="sctn_nodes",
             executable=executable,
+            # Counts where ROS_SECURITY_ENABLE is true: docs/guide/security.md.
+            ros_arguments=["--enclave", f"/sctn/{executable}"],
             namespace=LaunchConfiguration("namespace"),
             parameters=[share("config", f"{executable}.yaml"), {"use_sim_time": True, **parameters}],
             condition=condition,

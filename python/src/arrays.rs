@@ -1,10 +1,8 @@
 //! Rust values as arrays of numpy, and back.
 
 use heightmap::Heightmap;
-use nalgebra::Isometry2;
 use numpy::ndarray::{ArrayD, IxDyn};
 use numpy::{Element, IntoPyArray, PyArrayDyn, PyReadonlyArrayDyn, PyUntypedArrayMethods};
-use pick_place::PickPlace;
 use pyo3::exceptions::PyValueError;
 use pyo3::prelude::*;
 use pyo3::types::PyDict;
@@ -44,22 +42,4 @@ pub fn heightmap<'py>(py: Python<'py>, heightmap: &Heightmap) -> PyResult<Bound<
     dictionary.set_item("color", color)?;
     dictionary.set_item("height", height)?;
     Ok(dictionary)
-}
-
-/// x_m, y_m, yaw_rad of the pick, then of the place.
-pub fn numbers(action: &PickPlace) -> [f64; 6] {
-    let pose = |pose: &Isometry2<f64>| {
-        let position = pose.translation.vector;
-        [position.x, position.y, pose.rotation.angle()]
-    };
-    let ([a, b, c], [d, e, f]) = (pose(&action.pick), pose(&action.place));
-    [a, b, c, d, e, f]
-}
-
-/// The action of [`numbers`].
-pub fn action([x, y, yaw, to_x, to_y, to_yaw]: [f64; 6]) -> PickPlace {
-    PickPlace {
-        pick: Isometry2::new([x, y].into(), yaw),
-        place: Isometry2::new([to_x, to_y].into(), to_yaw),
-    }
 }

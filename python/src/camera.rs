@@ -17,7 +17,7 @@ pub struct PyCamera(Camera);
 #[pymethods]
 impl PyCamera {
     #[new]
-    #[pyo3(signature = (name, *, width, height, fx_px, fy_px, cx_px, cy_px, position_m, orientation_xyzw, distortion=[0.0; 5]))]
+    #[pyo3(signature = (name, *, width, height, fx_px, fy_px, cx_px, cy_px, position_m, orientation_xyzw, distortion=vec![], distortion_model="plumb_bob"))]
     #[allow(clippy::too_many_arguments, reason = "all have names in Python")]
     fn new(
         name: String,
@@ -29,7 +29,8 @@ impl PyCamera {
         cy_px: f64,
         position_m: [f64; 3],
         orientation_xyzw: [f64; 4],
-        distortion: [f64; 5],
+        distortion: Vec<f64>,
+        distortion_model: &str,
     ) -> PyResult<Self> {
         let [x, y, z, w] = orientation_xyzw;
         let quaternion = Quaternion::new(w, x, y, z);
@@ -39,7 +40,8 @@ impl PyCamera {
                 "camera {name}: orientation_xyzw is {orientation_xyzw:?}, expected a quaternion"
             )));
         }
-        let [k1, k2, p1, p2, k3] = distortion;
+        let distortion = Distortion::from_model(distortion_model, &distortion)
+            .map_err(|error| PyValueError::new_err(format!("camera {name}: {error}")))?;
         let camera = Camera {
             name,
             intrinsics: Intrinsics {
@@ -49,7 +51,7 @@ impl PyCamera {
                 fy_px,
                 cx_px,
                 cy_px,
-                distortion: Distortion { k1, k2, p1, p2, k3 },
+                distortion,
             },
             world_from_camera: Isometry3::from_parts(
                 Translation3::from(position_m),

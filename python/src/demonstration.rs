@@ -121,7 +121,7 @@ impl PyDemonstration {
     #[getter]
     fn actions<'py>(&self, py: Python<'py>) -> PyResult<Bound<'py, PyAny>> {
         let steps = &self.demonstration.steps;
-        let values = steps.iter().flat_map(|step| arrays::numbers(&step.action));
+        let values = steps.iter().flat_map(|step| step.action.to_array());
         Ok(arrays::array(py, &[steps.len(), 6], values.collect())?.into_any())
     }
 

@@ -1,6 +1,5 @@
 //! One episode: an environment, the demonstration whose images are its goals, and what a step shows.
 
-use crate::arrays::{action, numbers};
 use heightmap::{Heightmap, Workspace};
 use multiravens::{Environment, EnvironmentError, EpisodeSeed, Problem, StepReport};
 use pick_place::{Outcome, PickPlace};
@@ -138,7 +137,7 @@ impl Episode {
             return Err(EnvironmentError::Over.into());
         }
         let workspace = Workspace::RAVENS;
-        let action = crate::arrays::action(*action);
+        let action = PickPlace::from_array(*action);
         for (which, pose) in [("pick", action.pick), ("place", action.place)] {
             let inside = workspace.pixel(&pose.translation.vector.into()).is_some();
             if !(inside && pose.rotation.angle().is_finite()) {
@@ -156,8 +155,11 @@ impl Episode {
     /// Carries out an action.
     pub fn step(&mut self, given: &[f64; 6]) -> Result<Frame, EpisodeError> {
         self.check(given)?;
-        let same = |said: &PickPlace| numbers(said).map(f64::to_bits) == given.map(f64::to_bits);
-        let action = self.said.filter(same).unwrap_or_else(|| action(*given));
+        let same = |said: &PickPlace| said.to_array().map(f64::to_bits) == given.map(f64::to_bits);
+        let action = self
+            .said
+            .filter(same)
+            .unwrap_or_else(|| PickPlace::from_array(*given));
         let report = self.environment.step(&action)?;
         // As the operator of the paper does: a gain is the next image, a loss the one before.
         if report.delta_reward > 0.0 {
@@ -225,7 +227,7 @@ impl Episode {
             total_reward: environment.total_reward(),
             goals_reached: environment.goals_reached(),
             outcome: report.map(|report| report.outcome),
-            demonstrator_action: self.said.as_ref().map(numbers),
+            demonstrator_action: self.said.as_ref().map(PickPlace::to_array),
         })
     }
 }

@@ -2,8 +2,7 @@
 
 use bags::Demonstration;
 use heightmap::Workspace;
-use nalgebra::Isometry2;
-use pick_place::{Outcome, PickPlace, PrimitiveSettings};
+use pick_place::{Outcome, PrimitiveSettings};
 use serde::{Deserialize, Serialize};
 
 /// Path within a data set.
@@ -41,7 +40,7 @@ pub struct Step {
 impl From<&Demonstration> for Episode {
     fn from(demonstration: &Demonstration) -> Self {
         let steps = demonstration.steps.iter().map(|step| Step {
-            action: numbers(&step.action),
+            action: step.action.to_array(),
             module: step.module.clone(),
             delta_reward: step.delta_reward,
             outcome: step.outcome,
@@ -53,23 +52,5 @@ impl From<&Demonstration> for Episode {
             workspace: demonstration.last.workspace,
             steps: steps.collect(),
         }
-    }
-}
-
-/// x (m), y (m), yaw (rad) of the pick, then of the place.
-pub fn numbers(action: &PickPlace) -> [f64; 6] {
-    let pose = |pose: &Isometry2<f64>| {
-        let position = pose.translation.vector;
-        [position.x, position.y, pose.rotation.angle()]
-    };
-    let ([a, b, c], [d, e, f]) = (pose(&action.pick), pose(&action.place));
-    [a, b, c, d, e, f]
-}
-
-/// The action of [`numbers`].
-pub fn action([x, y, yaw, to_x, to_y, to_yaw]: [f64; 6]) -> PickPlace {
-    PickPlace {
-        pick: Isometry2::new([x, y].into(), yaw),
-        place: Isometry2::new([to_x, to_y].into(), to_yaw),
     }
 }

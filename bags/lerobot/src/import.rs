@@ -8,7 +8,7 @@ use image::ImageFormat;
 use parquet::errors::ParquetError;
 use parquet::file::reader::{FileReader as _, SerializedFileReader};
 use parquet::record::{Field, Row};
-use pick_place::{Outcome, PrimitiveSettings};
+use pick_place::{Outcome, PickPlace, PrimitiveSettings};
 use serde_json::Value;
 use std::collections::BTreeMap;
 use std::fs::{self, File};
@@ -270,7 +270,7 @@ impl Import {
             observation.workspace = workspace;
             DemonstrationStep {
                 observation,
-                action: extra::action(known.map_or(frame.action, |known| known.action)),
+                action: PickPlace::from_array(known.map_or(frame.action, |known| known.action)),
                 settings: known.map_or(PrimitiveSettings::RIGID, |known| known.settings),
                 module: known.map_or_else(|| problem.clone(), |known| known.module.clone()),
                 delta_reward: known.map_or(frame.reward, |known| known.delta_reward),
@@ -398,7 +398,7 @@ mod tests {
         };
         let step = |mark: u8, module: &str, outcome, settings| DemonstrationStep {
             observation: image(mark),
-            action: extra::action([0.3, 0.1 / 3.0, 0.7, 0.5, -0.2, -3.0]),
+            action: PickPlace::from_array([0.3, 0.1 / 3.0, 0.7, 0.5, -0.2, -3.0]),
             settings,
             module: module.to_owned(),
             delta_reward: if outcome == Outcome::Placed {
@@ -463,7 +463,7 @@ mod tests {
                     (&expected.module, expected.outcome)
                 );
                 assert_eq!(found.settings, expected.settings);
-                let numbers = [found, expected].map(|step| extra::numbers(&step.action));
+                let numbers = [found, expected].map(|step| step.action.to_array());
                 for (a, b) in numbers[0].iter().zip(numbers[1]) {
                     assert!((a - b).abs() < 1e-14, "{a} {b}");
                 }

@@ -215,7 +215,7 @@ impl DataSet {
             rewards: Vec::new(),
         };
         for (index, step) in demonstration.steps.iter().enumerate() {
-            let action = extra::numbers(&step.action).map(|value| value as f32);
+            let action = step.action.to_array().map(|value| value as f32);
             let action = action.to_vec();
             let name = steps.join(format!("step_{index:03}"));
             let path = |ending: &str| PathBuf::from(format!("{}_{ending}", name.display()));

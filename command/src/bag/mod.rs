@@ -1,7 +1,8 @@
-//! `sctn bag`: records, plays, looks into, checks and repairs bags.
+//! `sctn bag`: records, plays, looks into, films, checks and repairs bags.
 
 mod bench;
 mod export;
+mod film;
 mod import;
 mod play;
 mod record;
@@ -54,6 +55,8 @@ enum Command {
     Export(export::Export),
     /// Write the episodes of such a data set as bags
     Import(import::Import),
+    /// Draw a recorded run as an animated GIF: each proposal on the workspace, beside its goal, and its result
+    Film(film::Film),
     /// Measure the writer beside the disk, and a recording of three cameras
     Bench(bench::Bench),
 }
@@ -119,6 +122,7 @@ impl Bag {
             Command::Recover(recover) => recover.run(),
             Command::Export(export) => export.run(),
             Command::Import(import) => import.run(),
+            Command::Film(film) => film.run(),
             Command::Bench(bench) => bench.run(),
         }
     }

@@ -131,6 +131,8 @@ impl Settings {
             "--ros-args".to_owned(),
             "--params-file".into(),
             file.display().to_string(),
+            "--enclave".into(),
+            format!("/sctn/{node}"),
         ];
         let mut parameters = self.parameters(root, node);
         if let (Some(shown), "goal_oracle" | "operator_console") = (&self.demonstration, node) {

@@ -21,7 +21,7 @@ use recording::{LAST_HEIGHTMAP, LAST_WORDS, LAST_WORDS_ELSEWHERE, RunRecorder};
 use serde::Serialize;
 use std::path::{Path, PathBuf};
 use std::time::{Duration, Instant};
-use step_protocol::{Operator, OperatorDecision, ProposalId, Question, StepOutcome};
+use step_protocol::{Operator, OperatorDecision, ProposalId, Question, StepOutcome, Unasked};
 
 /// With nothing heard for so long, something is broken. Wall time: it decides no outcome, only when to give up.
 const PATIENCE: Duration = Duration::from_secs(60);
@@ -196,7 +196,7 @@ impl Launch {
         Ok(())
     }
 
-    /// What the run repeats; nothing where the problem has no goals: then a person teaches it.
+    /// What the run repeats; `None` where the problem has no goals: then a person teaches it.
     fn demonstration(
         &self,
         problem: &Problem,
@@ -251,12 +251,13 @@ impl Launch {
         self.require_approval.unwrap_or(usual)
     }
 
-    /// Proposals of a lower probability of success, or without one, wait for an approval.
-    fn asks(&self) -> f32 {
+    /// Which proposals wait for an approval, as the executor has it.
+    fn rule(&self) -> step_protocol::RequireApproval {
+        let threshold = self.sure_probability;
         match self.require_approval() {
-            RequireApproval::Always => f32::INFINITY,
-            RequireApproval::Unsure => self.sure_probability,
-            RequireApproval::Never => f32::NEG_INFINITY,
+            RequireApproval::Always => step_protocol::RequireApproval::Always,
+            RequireApproval::Unsure => step_protocol::RequireApproval::Unsure { threshold },
+            RequireApproval::Never => step_protocol::RequireApproval::Never,
         }
     }
 
@@ -279,7 +280,7 @@ impl Launch {
             None => "step_result".to_owned(),
         };
         let confirms = settings.operated && settings.goal_module == ORACLE;
-        let mut desk = Desk::new(&node, &results, confirms, self.asks())?;
+        let mut desk = Desk::new(&node, &results, confirms, self.rule())?;
         let mut graph = if self.processes {
             Graph::spawn(root, settings, &folder.join("logs"))?
         } else {
@@ -359,16 +360,20 @@ async fn recording_ended(recorder: Option<&RunRecorder>) {
     }
 }
 
-/// The operator's desk: what arrives, what is decided, how far the run is.
+/// The operator's desk in a run: what arrives, what is decided, how far the run is.
 struct Desk {
     node: Node,
     /// Whether the operator says which goal is next.
     confirms: bool,
-    /// See [`Launch::asks`].
-    asks_below: f32,
+    /// See [`Launch::rule`].
+    rule: step_protocol::RequireApproval,
+    /// Whether the executor carries proposals out by itself.
+    unasked: Unasked,
     /// Whether the last goal is said to be reached.
     goals_reached: bool,
     proposals: node_kit::Subscription<PickPlace>,
+    /// Proposals that came as goals of the executor's action.
+    accepted: node_kit::Subscription<PickPlace>,
     results: node_kit::Subscription<StepResult>,
     refused: node_kit::Subscription<ConfirmationRefused>,
     rewards: node_kit::Subscription<Reward>,
@@ -391,13 +396,20 @@ struct Desk {
 
 impl Desk {
     /// `results`: the topic of step results, or of those that are safe.
-    fn new(node: &Node, results: &str, confirms: bool, asks_below: f32) -> Result<Self> {
+    fn new(
+        node: &Node,
+        results: &str,
+        confirms: bool,
+        rule: step_protocol::RequireApproval,
+    ) -> Result<Self> {
         Ok(Self {
             node: node.clone(),
             confirms,
-            asks_below,
+            rule,
+            unasked: Unasked::new(rule),
             goals_reached: false,
             proposals: node.subscription("pick_place", Qos::Latched)?,
+            accepted: node.subscription("pick_place_goal", Qos::Event)?,
             results: node.subscription(results, Qos::Event)?,
             refused: node.subscription("confirmation_refused", Qos::Event)?,
             rewards: node.subscription("reward", Qos::Event)?,
@@ -440,6 +452,10 @@ impl Desk {
                     Ok(proposal) => questions.extend(self.operator.on_proposal(proposal)),
                     Err(error) => self.proposals.reject(error),
                 },
+                message = self.accepted.recv() => match convert::proposal_from_msg(&message) {
+                    Ok(proposal) => questions.extend(self.operator.on_proposal(proposal)),
+                    Err(error) => self.accepted.reject(error),
+                },
                 message = self.results.recv() => questions.extend(self.result(kind, &message)?),
                 message = self.rewards.recv() => match convert::reward_from_msg(&message) {
                     Ok(reward) => {
@@ -467,10 +483,10 @@ impl Desk {
                 () = tokio::time::sleep(LAST_RESULT), if self.goals_reached && !self.confirms => break,
                 () = silence, if kind == OperatorKind::Auto => {
                     questions = self.operator.on_silence();
-                    tracing::warn!("no step has gone on for {} s: what was said last is repeated", SILENCE.as_secs());
+                    tracing::warn!("no step has gone on for {} s: repeating the last decision", SILENCE.as_secs());
                 }
                 () = tokio::time::sleep(PATIENCE), if alone => {
-                    bail!("nothing heard for {} s; no node said why: see the logs", PATIENCE.as_secs());
+                    bail!("no message from any node for {} s: see the logs of the nodes", PATIENCE.as_secs());
                 }
             }
             heard = Instant::now();
@@ -494,6 +510,14 @@ impl Desk {
                 return Ok(None);
             }
         };
+        if matches!(
+            result.outcome,
+            StepOutcome::Fault | StepOutcome::Stopped | StepOutcome::NotHome
+        ) {
+            self.unasked.stop();
+        } else if result.outcome.motion().is_some() {
+            self.unasked.go_on(self.rule);
+        }
         if matches!(kind, OperatorKind::Web | OperatorKind::None) {
             // Whoever decides, in the page or by topic, sees faults and refusals, and decides how to go on.
             return Ok(self.operator.on_result(result));
@@ -546,6 +570,9 @@ impl Desk {
                 self.node.spawn_blocking(move || terminal(&ask)).await??
             }
         };
+        if decision == OperatorDecision::Stop {
+            self.unasked.stop();
+        }
         let message = confirmation(&self.node, question.proposal_id(), decision, "sctn launch")?;
         self.confirmations.publish(message);
         Ok(())
@@ -553,12 +580,9 @@ impl Desk {
 
     /// The executor carries the proposal out by itself.
     fn moves_unasked(&self, question: &Question) -> bool {
-        let Question::Approve(proposal) = question else {
-            return false;
-        };
-        match proposal.success_probability {
-            Some(probability) => probability >= self.asks_below,
-            None => self.asks_below == f32::NEG_INFINITY,
+        match question {
+            Question::Approve(proposal) => self.unasked.moves(self.rule, proposal),
+            Question::Confirm { .. } => false,
         }
     }
 

@@ -4,8 +4,7 @@ use anyhow::{Context as _, Result};
 use clap::ValueEnum;
 use msgs::{convert, sctn_msgs};
 use node_kit::Node;
-use std::time::Duration;
-use step_protocol::{Confirmation, OperatorDecision, Proposal, ProposalId, Question};
+use step_protocol::{Confirmation, OperatorDecision, Proposal, ProposalId, Question, Verdict};
 
 /// Which proposals an operator approves before they are carried out.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
@@ -81,7 +80,7 @@ impl Prompt {
         }
     }
 
-    /// What a typed line decides; nothing where it is none of the keys.
+    /// What a typed line decides; `None` where it is none of the keys.
     pub fn decision(&self, line: &str) -> Option<OperatorDecision> {
         let key = line.trim().to_lowercase();
         let mut answers = self.answers.iter();
@@ -97,8 +96,12 @@ pub fn described(proposal: &Proposal, step_count: u32) -> String {
     let probability = proposal.success_probability;
     let probability = probability.map(|probability| format!(", success {probability:.2}"));
     let probability = probability.unwrap_or_default();
+    let verdict = match proposal.verdict() {
+        Verdict::Act => String::new(),
+        verdict => format!(". {}", verdict.text()),
+    };
     format!(
-        "step {}/{step_count} attempt {}: {} pick ({:.3}, {:.3}) place ({:.3}, {:.3}, {:.0} deg), scores {:.2} {:.2}{probability}",
+        "step {}/{step_count} attempt {}: {} pick ({:.3}, {:.3}) place ({:.3}, {:.3}, {:.0} deg), scores {:.2} {:.2}{probability}{verdict}",
         proposal.step,
         proposal.attempt,
         proposal.module,
@@ -120,7 +123,7 @@ pub fn confirmation(
     operator_name: &str,
 ) -> Result<sctn_msgs::StepConfirmation> {
     let confirmation = Confirmation {
-        stamp: Duration::from_nanos(node.clock().now_ns().max(0) as u64),
+        stamp: node.clock().time(),
         proposal_id,
         decision,
         operator_name: operator_name.into(),
@@ -130,6 +133,11 @@ pub fn confirmation(
 
 #[cfg(test)]
 mod tests {
+    use std::time::Duration;
+
+    use nalgebra::Isometry2;
+    use pick_place::{PickPlace, PrimitiveSettings};
+
     use super::*;
 
     #[test]
@@ -149,5 +157,40 @@ mod tests {
         for line in ["", "yes", "b", "ys"] {
             assert_eq!(Prompt::APPROVE.decision(line), None, "{line}");
         }
+    }
+
+    #[test]
+    fn a_proposal_whose_goal_looks_reached_says_so_in_its_line() {
+        let proposal = |done: f32, success: f32| Proposal {
+            id: ProposalId(1),
+            frame: "world".into(),
+            stamp: Duration::ZERO,
+            problem: "stacking".into(),
+            step: 2,
+            attempt: 0,
+            module: "stacking".into(),
+            action: PickPlace {
+                pick: Isometry2::identity(),
+                place: Isometry2::identity(),
+            },
+            settings: PrimitiveSettings::RIGID,
+            pick_score: 0.5,
+            place_score: 0.5,
+            success_probability: Some(success),
+            checkpoint: String::new(),
+            author: String::new(),
+            done_probability: Some(done),
+        };
+        let done = described(&proposal(0.9, 0.1), 3);
+        assert!(
+            done.ends_with("success 0.10. the goal of this step looks reached already"),
+            "{done}"
+        );
+        let unknown = described(&proposal(0.1, 0.1), 3);
+        assert!(
+            unknown.ends_with("the policy does not know how to reach the goal"),
+            "{unknown}"
+        );
+        assert!(described(&proposal(0.1, 0.9), 3).ends_with("success 0.90"));
     }
 }

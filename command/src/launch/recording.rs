@@ -28,10 +28,11 @@ const DISCOVERY: Duration = Duration::from_secs(20);
 /// How long what shows the end of the run may take: images are best effort, and said again twice a second.
 pub const LAST_HEIGHTMAP: Duration = Duration::from_secs(20);
 
-const TOPICS: [(&str, &str, Qos); 11] = [
+const TOPICS: [(&str, &str, Qos); 12] = [
     ("heightmap", Heightmap::TYPE_NAME, Qos::LATCHED),
     ("goal", Goal::TYPE_NAME, Qos::LATCHED),
     ("pick_place", PickPlace::TYPE_NAME, Qos::LATCHED),
+    ("pick_place_goal", PickPlace::TYPE_NAME, Qos::RELIABLE),
     ("planned_motion", PlannedMotion::TYPE_NAME, Qos::LATCHED),
     (
         "step_confirmation",

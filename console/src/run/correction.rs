@@ -34,7 +34,7 @@ impl Run {
     }
 }
 
-/// The step as a demonstration; nothing where what was before or after it was not seen, or its motion was broken off.
+/// The step as a demonstration; `None` where what was before or after it was not seen, or its motion was broken off.
 fn demonstration(step: &PastStep) -> Option<(String, Demonstration)> {
     let PastStep {
         proposal,

@@ -3,12 +3,12 @@
 use std::time::Duration;
 
 use serde::{Deserialize, Serialize};
-use step_protocol::OperatorDecision;
+use step_protocol::{OperatorDecision, RunPhase};
 
+use super::Run;
 use super::outcome::sentence;
 use super::view::TableChange;
-use super::{Run, Status};
-use crate::refusal::{Refusal, advice};
+use crate::refusal::{Refusal, advice_on};
 
 /// What an operator decides, as the API names it.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, PartialOrd, Ord, Serialize, Deserialize)]
@@ -56,46 +56,7 @@ impl From<Decision> for OperatorDecision {
     }
 }
 
-/// How far the run is.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize)]
-#[serde(rename_all = "snake_case")]
-pub enum Phase {
-    /// No goal has come.
-    NoGoal,
-    /// The policy has not proposed anything for the present goal.
-    AwaitingProposal,
-    /// A proposal waits for the operator.
-    Proposed,
-    /// The approved proposal is being carried out.
-    Moving,
-    /// The arm has moved: the operator says whether the step succeeded.
-    AwaitingConfirmation,
-    /// The motion broke off by itself.
-    Fault,
-    /// An operator has ended the run.
-    Stopped,
-    /// All steps are done.
-    Complete,
-}
-
 impl Run {
-    /// How far the run is.
-    pub fn phase(&self) -> Phase {
-        match &self.goal {
-            None => return Phase::NoGoal,
-            Some(goal) if goal.complete => return Phase::Complete,
-            Some(_) if self.stopped => return Phase::Stopped,
-            Some(_) => {}
-        }
-        match self.current().map(|offered| &offered.status) {
-            None | Some(Status::Closed | Status::Confirmed { .. }) => Phase::AwaitingProposal,
-            Some(Status::Open) => Phase::Proposed,
-            Some(Status::Approved) => Phase::Moving,
-            Some(Status::Moved { fault: false }) => Phase::AwaitingConfirmation,
-            Some(Status::Moved { fault: true }) => Phase::Fault,
-        }
-    }
-
     /// Whether a decision would be taken now; else why not.
     ///
     /// # Errors
@@ -103,11 +64,11 @@ impl Run {
     pub fn check(&self, decision: Decision, now: Duration) -> Result<(), Refusal> {
         let phase = self.phase();
         let allowed = match decision {
-            Decision::Approve | Decision::Reject => phase == Phase::Proposed,
+            Decision::Approve | Decision::Reject => phase == RunPhase::Proposed,
             Decision::Advance | Decision::Retry => {
-                matches!(phase, Phase::AwaitingConfirmation | Phase::Fault)
+                matches!(phase, RunPhase::AwaitingConfirmation | RunPhase::Fault)
             }
-            Decision::Stop => !matches!(phase, Phase::Complete | Phase::NoGoal),
+            Decision::Stop => !matches!(phase, RunPhase::Complete | RunPhase::NoGoal),
         };
         if !allowed {
             return Err(out_of_phase(phase));
@@ -138,14 +99,14 @@ impl Run {
         (!reason.is_empty()).then(|| {
             Refusal::new(
                 format!("The motion cannot be planned: {}", sentence(reason)),
-                advice(reason),
+                advice_on(reason),
             )
         })
     }
 
     /// Why the present proposal is stale: the table has changed since the heightmap that it was made from.
     fn change(&self) -> Option<Refusal> {
-        let reason = match self.current()?.change? {
+        let reason = match self.present_change()? {
             TableChange::Blob(change) => format!(
                 "The proposal is stale: the table has changed about ({:.3}, {:.3}) m since the picture that it was made from.",
                 change.center_m.x, change.center_m.y
@@ -188,13 +149,13 @@ impl Run {
         (message != "ready").then(|| {
             Refusal::new(
                 format!("The robot is not ready: {}", sentence(message)),
-                advice(message),
+                advice_on(message),
             )
         })
     }
 
-    pub(super) fn headline(&self, phase: Phase) -> (String, &'static str) {
-        let step = match &self.goal {
+    pub(super) fn headline(&self, phase: RunPhase) -> (String, &'static str) {
+        let step = match self.goal() {
             Some(goal) if goal.attempt > 0 => format!(
                 "Step {} of {}, attempt {}",
                 goal.step,
@@ -205,64 +166,64 @@ impl Run {
             None => String::new(),
         };
         match phase {
-            Phase::NoGoal => (
+            RunPhase::NoGoal => (
                 "No goal yet".into(),
                 "The goal oracle has no demonstration. Load one, or start it with one.",
             ),
-            Phase::AwaitingProposal => (
+            RunPhase::AwaitingProposal => (
                 format!("{step}: waiting for a proposal"),
                 "The policy looks at the table.",
             ),
-            Phase::Proposed => (
+            RunPhase::Proposed => (
                 format!("{step}: the policy proposes a move"),
                 "Look at pick and place in the picture. Approve it if it brings the table closer to the goal, else reject it.",
             ),
-            Phase::Moving => (
+            RunPhase::Moving => (
                 format!("{step}: the arm moves"),
                 "Watch the cell. Stop if anything is wrong.",
             ),
-            Phase::AwaitingConfirmation => (
+            RunPhase::AwaitingConfirmation => (
                 format!("{step}: did it succeed?"),
                 "Compare the present view with the goal. Next step if it succeeded, try again if not.",
             ),
-            Phase::Fault => (
+            RunPhase::Fault => (
                 format!("{step}: the robot broke the motion off"),
                 "Look at the cell. When it is safe, bring the arm home, then try the step again.",
             ),
-            Phase::Stopped => (
+            RunPhase::Stopped => (
                 format!("{step}: stopped"),
                 "Look at the cell. When it is safe, bring the arm home, then continue.",
             ),
-            Phase::Complete => ("All steps are done".into(), "Nothing is left to do."),
+            RunPhase::Complete => ("All steps are done".into(), "Nothing is left to do."),
         }
     }
 }
 
-pub(super) fn out_of_phase(phase: Phase) -> Refusal {
+pub(super) fn out_of_phase(phase: RunPhase) -> Refusal {
     let (reason, advice) = match phase {
-        Phase::NoGoal => ("There is no goal.", "Load a demonstration first."),
-        Phase::AwaitingProposal => (
+        RunPhase::NoGoal => ("There is no goal.", "Load a demonstration first."),
+        RunPhase::AwaitingProposal => (
             "There is no proposal to decide on.",
             "Wait for the policy's next proposal.",
         ),
-        Phase::Proposed => (
+        RunPhase::Proposed => (
             "The proposal has not been carried out.",
             "Approve it or reject it first.",
         ),
-        Phase::Moving => ("The arm is moving.", "Wait until it is back, or stop it."),
-        Phase::AwaitingConfirmation => (
+        RunPhase::Moving => ("The arm is moving.", "Wait until it is back, or stop it."),
+        RunPhase::AwaitingConfirmation => (
             "The proposal was already carried out.",
             "Say whether the step succeeded.",
         ),
-        Phase::Fault => (
+        RunPhase::Fault => (
             "The robot broke the motion off.",
             "Bring the arm home, then try the step again.",
         ),
-        Phase::Stopped => (
+        RunPhase::Stopped => (
             "The run is stopped.",
             "Continue the run with the present step.",
         ),
-        Phase::Complete => ("All steps are done.", "Nothing is left to do."),
+        RunPhase::Complete => ("All steps are done.", "Nothing is left to do."),
     };
     Refusal::new(reason, advice)
 }

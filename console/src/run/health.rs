@@ -5,10 +5,14 @@ use std::time::Duration;
 
 use serde::Serialize;
 
+use step_protocol::RunPhase;
+
 use super::Run;
 
 /// Nodes whose diagnostics are kept.
 const NODES: usize = 64;
+/// Joint positions are taken over at most this often: a UR5 sends 500 a second.
+const JOINTS_PERIOD: Duration = Duration::from_millis(100);
 
 /// A node's diagnostics.
 #[derive(Debug, Default)]
@@ -16,7 +20,7 @@ pub(super) struct NodeHealth {
     pub(super) heard: Duration,
     /// Name of the state, level, message.
     pub(super) states: BTreeMap<String, (u8, String)>,
-    /// Age of each camera stream when the diagnostics were sent [s]; nothing where none has come.
+    /// Age of each camera stream when the diagnostics were sent [s]; `None` where none has come.
     pub(super) images: BTreeMap<String, Option<f64>>,
 }
 
@@ -72,7 +76,10 @@ impl Run {
             health.states.clear();
             health.images.clear();
             for (topic, line) in values {
-                if let Some(age_s) = image_age(&topic, &line) {
+                let mut endings = self.watch.image_topics.iter();
+                if endings.any(|ending| topic.ends_with(ending))
+                    && let Some(age_s) = heard_age(&line)
+                {
                     health.images.insert(topic, age_s);
                 }
             }
@@ -80,14 +87,52 @@ impl Run {
         health.states.insert(state, (level, message));
     }
 
-    /// The joints have been read.
-    pub fn on_joints(&mut self, names: Vec<String>, positions_rad: Vec<f64>, now: Duration) {
+    /// The joints have been read. Returns whether viewers are to be told: they see the arm move.
+    pub fn on_joints(
+        &mut self,
+        names: Vec<String>,
+        positions_rad: Vec<f64>,
+        now: Duration,
+    ) -> bool {
+        let last = self.joints.as_ref().map(|(heard, ..)| *heard);
+        if last.is_some_and(|last| now.saturating_sub(last) < JOINTS_PERIOD) {
+            return false;
+        }
         self.joints = Some((now, names, positions_rad));
+        self.phase() == RunPhase::Moving
     }
 
-    /// The driver has said something of the robot.
-    pub fn on_robot(&mut self, change: impl FnOnce(&mut Robot)) {
-        change(&mut self.robot);
+    /// The driver has said whether suction is on and whether the vacuum sensor feels an object, where it has those pins. Returns
+    /// whether viewers are to be told: what is held can be put down.
+    pub fn on_pins(&mut self, suction: Option<bool>, vacuum: Option<bool>) -> bool {
+        let held = self.holds();
+        (self.robot.suction, self.robot.vacuum) = (suction, vacuum);
+        self.holds() != held
+    }
+
+    /// The driver has said in which mode the robot is.
+    pub fn on_robot_mode(&mut self, mode: i8) {
+        self.robot.robot_mode = Some(mode);
+    }
+
+    /// The driver has said in which mode the robot's safety system is.
+    pub fn on_safety_mode(&mut self, mode: u8) {
+        self.robot.safety_mode = Some(mode);
+    }
+
+    /// The driver has said whether the robot program runs.
+    pub fn on_program(&mut self, runs: bool) {
+        self.robot.program_running = Some(runs);
+    }
+
+    /// The driver has said with how many percent of the planned speed the arm moves.
+    pub fn on_speed_scaling(&mut self, percent: f64) {
+        self.robot.speed_scaling = percent.is_finite().then_some(percent / 100.0);
+    }
+
+    /// Whether the vacuum sensor feels an object.
+    pub fn holds(&self) -> bool {
+        self.robot.vacuum == Some(true)
     }
 
     /// The age of all that should come regularly.
@@ -125,11 +170,8 @@ impl Run {
     }
 }
 
-/// The age that a node's diagnostics give for an image topic that it hears.
-fn image_age(topic: &str, line: &str) -> Option<Option<f64>> {
-    if !(topic.ends_with("/image_raw") || topic.ends_with("/image_rect_raw")) {
-        return None;
-    }
+/// The age that a node's diagnostics give for a topic that it hears.
+fn heard_age(line: &str) -> Option<Option<f64>> {
     let words = line.strip_prefix("in ")?.split_whitespace();
     let age = words
         .filter_map(|word| word.strip_prefix("age_s="))

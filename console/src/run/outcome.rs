@@ -3,98 +3,95 @@
 use std::time::Duration;
 
 use step_protocol::{
-    Confirmation, ProposalId, ProposalStatus, RefusalKind, StepOutcome, StepResult,
+    Confirmation, OperatorDecision, Proposal, ProposalId, RefusalKind, StepOutcome, StepResult,
 };
 
-use super::answer::Unanswered;
-use super::{Decision, PastStep, Run, STEPS, Status};
-use crate::refusal::{advice, advice_for, advice_of_oracle};
+use super::{Decision, PastStep, Run, STEPS};
+use crate::refusal::{advice_for, advice_of_oracle, advice_on};
 
 impl Run {
-    /// An operator has decided, here or elsewhere.
-    pub fn on_confirmation(&mut self, confirmation: &Confirmation, now: Duration) {
-        let id = confirmation.proposal_id;
-        let Some(decision) = Decision::of(confirmation.decision) else {
-            return;
-        };
-        if decision == Decision::Stop {
-            self.stopped = self.goal.as_ref().is_some_and(|goal| !goal.complete);
-            self.unanswered = None;
-            return;
+    /// The operator decides here: the confirmation is being published.
+    pub fn decide(&mut self, confirmation: &Confirmation, now: Duration) {
+        self.operator.decide(confirmation, now);
+        self.record_decision(confirmation);
+    }
+
+    /// A decision has come on the topic. Returns whether it is news: one that was made here is known already.
+    pub fn on_confirmation(&mut self, confirmation: &Confirmation, now: Duration) -> bool {
+        let is_news = self.operator.on_confirmation(confirmation, now);
+        if is_news {
+            self.record_decision(confirmation);
         }
-        if let (Decision::Advance | Decision::Retry, Some(step)) = (
-            decision,
-            self.steps.iter_mut().rfind(|step| step.proposal.id == id),
-        ) {
-            step.decision = Some(decision);
+        is_news
+    }
+
+    fn record_decision(&mut self, confirmation: &Confirmation) {
+        let decision = Decision::of(confirmation.decision);
+        let mut steps = self.steps.iter_mut();
+        let step = steps.rfind(|step| step.proposal.id == confirmation.proposal_id);
+        if let (Some(Decision::Advance | Decision::Retry), Some(step)) = (decision, step) {
+            step.decision = decision;
             step.decided_by.clone_from(&confirmation.operator_name);
         }
-        if let Some(offered) = self.offered(id) {
-            let status = match (decision, &offered.status) {
-                (Decision::Approve, Status::Open) => Status::Approved,
-                (Decision::Reject, Status::Open) => Status::Closed,
-                (Decision::Advance | Decision::Retry, Status::Moved { fault }) => {
-                    Status::Confirmed { fault: *fault }
-                }
-                _ => return,
-            };
-            let before = std::mem::replace(&mut offered.status, status);
-            self.unanswered = Some(Unanswered {
-                proposal_id: id,
-                decision,
-                before,
-                since: now,
-            });
+        self.compare();
+    }
+
+    /// The goal oracle goes on with the present step.
+    pub fn on_continued(&mut self) {
+        self.operator.on_continued();
+    }
+
+    /// The executor moves the arm, or has ended a motion.
+    pub fn on_motion(&mut self, moves: bool, now: Duration) {
+        if moves {
+            self.operator.on_motion(now);
         }
+    }
+
+    /// Opens the question again where a decision was not heard. Returns the proposal that the decision was about.
+    pub fn ask_again(&mut self, now: Duration) -> Option<ProposalId> {
+        let (id, decision) = self.operator.ask_again(now)?;
+        self.compare();
+        let (who, what) = match decision {
+            OperatorDecision::Approve => ("executor", "approval"),
+            OperatorDecision::Reject => ("goal oracle", "rejection"),
+            _ => ("goal oracle", "decision on the step"),
+        };
+        let reason = format!("The {who} has not answered the {what}: it may have been lost.");
+        let advice = format!("Look whether the {who} is at work, then decide again.");
+        self.note("refusal", reason, advice, now);
+        Some(id)
+    }
+
+    /// The proposal to be rejected once more by the console itself: see [`Operator::probe`](step_protocol::Operator::probe).
+    pub fn probe(&mut self, now: Duration) -> Option<ProposalId> {
+        let id = self.operator.probe(now)?;
+        self.probed = Some(id);
+        Some(id)
     }
 
     /// The executor has reported.
     pub fn on_result(&mut self, result: &StepResult, now: Duration) {
         let id = result.proposal_id;
-        // What is said of a rejection or of the next step is the oracle's to answer.
-        self.unanswered
-            .take_if(|asked| asked.proposal_id == id && asked.decision == Decision::Approve);
+        let was_stopped = self.operator.is_stopped();
+        self.operator.on_result(result.clone());
+        self.compare();
         match result.outcome {
             StepOutcome::Refused => {
-                let carried_out = result.was_carried_out();
-                if let Some(offered) = self.offered(id) {
-                    offered.status = match (&offered.status, result.status) {
-                        // The result was lost, for instance while the console was not there.
-                        (Status::Approved, _) if carried_out => Status::Moved { fault: false },
-                        (Status::Open | Status::Approved, Some(status)) => match status {
-                            ProposalStatus::Moving => Status::Approved,
-                            ProposalStatus::Superseded
-                            | ProposalStatus::Rejected
-                            | ProposalStatus::Withdrawn => Status::Closed,
-                            ProposalStatus::Pending | ProposalStatus::Done => Status::Open,
-                        },
-                        (Status::Approved, None) => Status::Open,
-                        (status, _) => (*status).clone(),
-                    };
-                }
+                let is_probe = self.probed.take_if(|probed| *probed == id).is_some();
                 // A stop that found nothing to stop has stopped the run all the same.
-                if self.stopped && self.offered(id).is_none() {
-                    return;
+                let is_of_stop = was_stopped && self.proposal(id).is_none();
+                if !is_probe && !is_of_stop {
+                    let advice = advice_for(result.status, &result.reason);
+                    self.note("refusal", sentence(&result.reason), advice, now);
                 }
-                let advice = advice_for(result.status, &result.reason);
-                self.note("refusal", sentence(&result.reason), advice, now);
-                return;
             }
-            StepOutcome::Rejected => {
-                if let Some(offered) = self.offered(id) {
-                    offered.status = Status::Closed;
-                }
-                return;
-            }
-            StepOutcome::Stopped => {
-                self.stopped = true;
-                self.note(
-                    "note",
-                    "The run was stopped.",
-                    "Look at the cell. When it is safe, bring the arm home, then continue with the present step.",
-                    now,
-                );
-            }
+            StepOutcome::Stopped => self.note(
+                "note",
+                "The run was stopped.",
+                "Look at the cell. When it is safe, bring the arm home, then continue with the present step.",
+                now,
+            ),
             StepOutcome::Fault => self.note(
                 "fault",
                 format!(
@@ -105,31 +102,36 @@ impl Run {
                 now,
             ),
             StepOutcome::AtHome => {
-                self.note("note", "The arm is at home.", "", now);
-                return;
+                let text = match result.reason.as_str() {
+                    "" => "The arm is at home.".to_owned(),
+                    reason => sentence(&format!("the arm is at home: {reason}")),
+                };
+                self.note("note", text, "", now);
             }
             StepOutcome::NotHome => {
                 let text = format!("The arm did not go home: {}", result.reason);
-                self.note("refusal", text, advice(&result.reason), now);
-                return;
+                self.note("refusal", text, advice_on(&result.reason), now);
             }
-            StepOutcome::Placed
+            StepOutcome::Rejected
+            | StepOutcome::Placed
             | StepOutcome::NoContact
             | StepOutcome::GraspFailed
             | StepOutcome::Dropped
             | StepOutcome::LagAborted => {}
         }
-        let Some(offered) = self.offered(id) else {
-            return;
-        };
-        if !result.arm_moved() {
-            offered.status = Status::Closed;
+        if result.arm_moved()
+            && let Some(proposal) = self.proposal(id).cloned()
+        {
+            self.record_step(proposal, result);
+        }
+    }
+
+    fn record_step(&mut self, proposal: Proposal, result: &StepResult) {
+        let is_same =
+            |step: &PastStep| (step.proposal.id, step.ended) == (proposal.id, result.stamp);
+        if self.steps.iter().any(is_same) {
             return;
         }
-        offered.status = Status::Moved {
-            fault: result.outcome == StepOutcome::Fault,
-        };
-        let proposal = offered.proposal.clone();
         let mut views = self.views.iter();
         let before = views.rfind(|view| view.stamp == proposal.stamp).cloned();
         self.step_count += 1;
@@ -160,21 +162,7 @@ impl Run {
         reason: &str,
         now: Duration,
     ) {
-        self.unanswered.take_if(|asked| asked.proposal_id == id);
-        match kind {
-            // The question is still open.
-            Some(RefusalKind::Unknown) => {
-                if let Some(offered) = self.offered(id)
-                    && let Status::Confirmed { fault } = offered.status
-                {
-                    offered.status = Status::Moved { fault };
-                }
-            }
-            Some(RefusalKind::Stopped) => {
-                self.stopped = self.goal.as_ref().is_some_and(|goal| !goal.complete);
-            }
-            _ => {}
-        }
+        self.operator.on_confirmation_refused(id, kind);
         self.note("refusal", sentence(reason), advice_of_oracle(kind), now);
     }
 }

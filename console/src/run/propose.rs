@@ -5,10 +5,10 @@ use std::time::Duration;
 use nalgebra::{Isometry2, Point2, Vector2};
 use pick_place::{PickPlace, PrimitiveSettings};
 use serde::{Deserialize, Serialize};
-use step_protocol::{Proposal, ProposalId, yaw_rad};
+use step_protocol::{Proposal, ProposalId, RunPhase, yaw_rad};
 
 use super::decide::out_of_phase;
-use super::{Phase, Run, View};
+use super::{Run, View};
 use crate::refusal::Refusal;
 
 /// Problem and task module of what is shown in a lesson.
@@ -57,10 +57,10 @@ impl Run {
     /// When nothing can be proposed now, or a pose lies outside the workspace.
     pub fn correction(&self, pick: Pose, place: Pose, author: &str) -> Result<Proposal, Refusal> {
         let phase = self.phase();
-        if !matches!(phase, Phase::Proposed | Phase::AwaitingProposal) {
+        if !matches!(phase, RunPhase::Proposed | RunPhase::AwaitingProposal) {
             return Err(out_of_phase(phase));
         }
-        let (Some(goal), Some(view)) = (&self.goal, self.views.back()) else {
+        let (Some(goal), Some(view)) = (self.goal(), self.views.back()) else {
             return Err(no_picture());
         };
         if view.stamp < goal.stamp {
@@ -80,11 +80,7 @@ impl Run {
             author,
         };
         let proposal = proposal.on(view)?;
-        if self
-            .offered
-            .iter()
-            .any(|known| known.proposal.id == proposal.id)
-        {
+        if self.proposal(proposal.id).is_some() {
             return Err(Refusal::new(
                 "The same correction was made before.",
                 "Approve it, or move pick, place or turn.",
@@ -164,6 +160,7 @@ impl Shown<'_> {
             pick_score: 0.0,
             place_score: 0.0,
             success_probability: None,
+            done_probability: None,
             checkpoint: String::new(),
             author: self.author.to_owned(),
         })

@@ -4,11 +4,11 @@ use std::collections::{BTreeMap, VecDeque};
 use std::time::Duration;
 
 use heightmap::Workspace;
-use serde::Serialize;
-use step_protocol::Proposal;
+use serde::{Serialize, Serializer};
+use step_protocol::{Proposal, RunPhase};
 
 use super::health::{NodeState, Robot, Stream, worst};
-use super::{Decision, Notice, PastStep, Phase, Pose, Run, View, outcome_words};
+use super::{Decision, Notice, PastStep, Pose, Run, View, outcome_words};
 use crate::preview::Motion;
 use crate::refusal::Refusal;
 
@@ -16,7 +16,8 @@ use crate::refusal::Refusal;
 #[derive(Debug, Serialize)]
 #[allow(missing_docs)]
 pub struct Snapshot<'a> {
-    pub phase: Phase,
+    #[serde(serialize_with = "as_name")]
+    pub phase: RunPhase,
     pub headline: String,
     pub advice: &'static str,
     /// What is shown may not be what is there.
@@ -34,6 +35,10 @@ pub struct Snapshot<'a> {
     reward: Option<f64>,
     scores: Option<u64>,
     robot_description: bool,
+}
+
+fn as_name<S: Serializer>(phase: &RunPhase, serializer: S) -> Result<S::Ok, S::Error> {
+    serializer.serialize_str(phase.name())
 }
 
 /// A planned motion that waits for an approval.
@@ -122,6 +127,10 @@ pub struct ProposalState<'a> {
     place_score: f32,
     /// Nothing where nothing estimates it.
     success_probability: Option<f32>,
+    /// Nothing where nothing estimates it.
+    done_probability: Option<f32>,
+    /// What the estimates say against carrying it out, for people; empty where nothing.
+    verdict: &'static str,
     checkpoint: &'a str,
     author: &'a str,
     stamp_s: f64,
@@ -139,6 +148,8 @@ impl<'a> ProposalState<'a> {
             pick_score: proposal.pick_score,
             place_score: proposal.place_score,
             success_probability: proposal.success_probability,
+            done_probability: proposal.done_probability,
+            verdict: proposal.verdict().text(),
             checkpoint: &proposal.checkpoint,
             author: &proposal.author,
             stamp_s: proposal.stamp.as_secs_f64(),
@@ -195,7 +206,7 @@ impl Run {
                 age_s: since(view.arrived),
                 ..ViewState::of(view)
             }),
-            goal: self.goal.as_ref().map(|goal| GoalState {
+            goal: self.goal().map(|goal| GoalState {
                 problem: &goal.problem,
                 demonstration: &goal.demonstration,
                 step: goal.step,
@@ -208,7 +219,7 @@ impl Run {
                     .filter_map(|step| Some((step, self.strip(step)?.number)))
                     .collect(),
             }),
-            proposal: current.map(|offered| ProposalState::of(&offered.proposal)),
+            proposal: current.map(ProposalState::of),
             steps: self.steps.iter().map(StepState::of).collect(),
             notices: &self.notices,
             streams: self.streams(now),
@@ -225,7 +236,7 @@ impl Run {
                     .zip(positions.iter().copied())
                     .collect()
             }),
-            reward: self.reward.as_ref().map(|reward| reward.total),
+            reward: self.operator.reward().map(|reward| reward.total),
             scores: self.scores().map(|(number, _)| number),
             robot_description: self.robot_description.is_some(),
         }

@@ -116,34 +116,34 @@ fn proposed() -> Run {
 #[test]
 fn a_run_goes_from_proposal_to_approval_motion_confirmation_and_its_end() {
     let mut run = fresh();
-    assert_eq!(run.phase(), Phase::NoGoal);
+    assert_eq!(run.phase(), RunPhase::NoGoal);
     run.on_heightmap(heightmap(10, 0.0), NOW);
     run.on_goal(goal(1, 0, 0), NOW).unwrap();
-    assert_eq!(run.phase(), Phase::AwaitingProposal);
+    assert_eq!(run.phase(), RunPhase::AwaitingProposal);
     run.on_proposal(proposal(7, 1, 0, 10)).unwrap();
     assert_eq!(
         (run.phase(), run.current_id()),
-        (Phase::Proposed, Some(id(7)))
+        (RunPhase::Proposed, Some(id(7)))
     );
     run.check(Decision::Approve, NOW).unwrap_err();
     run.on_planned_motion(planned(7));
     run.check(Decision::Approve, NOW).unwrap();
     run.on_confirmation(&confirmation(7, Decision::Approve), NOW);
-    assert_eq!(run.phase(), Phase::Moving);
+    assert_eq!(run.phase(), RunPhase::Moving);
     run.check(Decision::Approve, NOW).unwrap_err();
     run.check(Decision::Stop, NOW).unwrap();
     run.on_result(&result(7, StepOutcome::Placed, 20), NOW);
-    assert_eq!(run.phase(), Phase::AwaitingConfirmation);
+    assert_eq!(run.phase(), RunPhase::AwaitingConfirmation);
     run.check(Decision::Advance, NOW).unwrap();
     run.on_heightmap(heightmap(21, 0.1), NOW);
     run.on_confirmation(&confirmation(7, Decision::Advance), NOW);
-    assert_eq!(run.phase(), Phase::AwaitingProposal);
+    assert_eq!(run.phase(), RunPhase::AwaitingProposal);
     let (before, after) = run.past_step(1).unwrap();
     assert_eq!((before.unwrap().number, after.unwrap().number), (1, 2));
     let mut last = goal(2, 0, 20);
     last.complete = true;
     run.on_goal(last, NOW).unwrap();
-    assert_eq!(run.phase(), Phase::Complete);
+    assert_eq!(run.phase(), RunPhase::Complete);
     run.check(Decision::Stop, NOW).unwrap_err();
 }
 
@@ -151,11 +151,15 @@ fn a_run_goes_from_proposal_to_approval_motion_confirmation_and_its_end() {
 fn a_proposal_that_comes_before_its_goal_is_shown_with_it() {
     let mut run = proposed();
     run.on_proposal(proposal(8, 2, 0, 20)).unwrap();
-    assert_eq!(run.phase(), Phase::AwaitingProposal);
+    // The present one stands as long as its goal does.
+    assert_eq!(
+        (run.phase(), run.current_id()),
+        (RunPhase::Proposed, Some(id(7)))
+    );
     run.on_goal(goal(2, 0, 20), NOW).unwrap();
     assert_eq!(
         (run.phase(), run.current_id()),
-        (Phase::Proposed, Some(id(8)))
+        (RunPhase::Proposed, Some(id(8)))
     );
 }
 
@@ -166,7 +170,7 @@ fn a_refused_approval_opens_the_proposal_again_and_says_why_and_what_to_do() {
     let mut refusal = result(7, StepOutcome::Refused, 11);
     refusal.reason = "proposal 7: the observation has changed since".into();
     run.on_result(&refusal, NOW);
-    assert_eq!(run.phase(), Phase::Proposed);
+    assert_eq!(run.phase(), RunPhase::Proposed);
     let json = serde_json::to_value(run.snapshot(NOW)).unwrap();
     assert_eq!(json["notices"][0]["kind"], "refusal");
     let advice = json["notices"][0]["advice"].as_str().unwrap();
@@ -184,11 +188,11 @@ fn a_refused_advance_asks_again_whether_the_step_succeeded() {
         run.on_confirmation_refused(id(7), Some(kind), reason, NOW);
     };
     refuse(&mut run, RefusalKind::Twice);
-    assert_eq!(run.phase(), Phase::AwaitingProposal);
+    assert_eq!(run.phase(), RunPhase::AwaitingProposal);
     refuse(&mut run, RefusalKind::Unknown);
-    assert_eq!(run.phase(), Phase::AwaitingConfirmation);
+    assert_eq!(run.phase(), RunPhase::AwaitingConfirmation);
     refuse(&mut run, RefusalKind::Stopped);
-    assert_eq!(run.phase(), Phase::Stopped);
+    assert_eq!(run.phase(), RunPhase::Stopped);
     let json = serde_json::to_value(run.snapshot(NOW)).unwrap();
     let kinds: Vec<_> = json["notices"]
         .as_array()
@@ -202,13 +206,13 @@ fn a_refused_advance_asks_again_whether_the_step_succeeded() {
 #[test]
 fn where_the_executor_says_that_a_proposal_stands_is_where_it_is_shown() {
     for (status, phase) in [
-        (Some(ProposalStatus::Pending), Phase::Proposed),
-        (Some(ProposalStatus::Superseded), Phase::AwaitingProposal),
-        (Some(ProposalStatus::Moving), Phase::Moving),
-        (Some(ProposalStatus::Done), Phase::AwaitingConfirmation),
-        (Some(ProposalStatus::Rejected), Phase::AwaitingProposal),
-        (Some(ProposalStatus::Withdrawn), Phase::AwaitingProposal),
-        (None, Phase::Proposed),
+        (Some(ProposalStatus::Pending), RunPhase::Proposed),
+        (Some(ProposalStatus::Superseded), RunPhase::AwaitingProposal),
+        (Some(ProposalStatus::Moving), RunPhase::Moving),
+        (Some(ProposalStatus::Done), RunPhase::AwaitingConfirmation),
+        (Some(ProposalStatus::Rejected), RunPhase::AwaitingProposal),
+        (Some(ProposalStatus::Withdrawn), RunPhase::AwaitingProposal),
+        (None, RunPhase::Proposed),
     ] {
         let mut run = proposed();
         run.on_confirmation(&confirmation(7, Decision::Approve), NOW);
@@ -223,7 +227,7 @@ fn a_stop_that_only_withdrew_the_proposal_is_no_step() {
     let mut stopped = result(7, StepOutcome::Stopped, 11);
     stopped.status = Some(ProposalStatus::Withdrawn);
     run.on_result(&stopped, NOW);
-    assert_eq!(run.phase(), Phase::Stopped);
+    assert_eq!(run.phase(), RunPhase::Stopped);
     assert!(run.past_step(1).is_none());
 }
 
@@ -261,6 +265,7 @@ fn who_made_a_proposal_and_how_likely_it_succeeds_is_shown() {
     run.on_proposal(made).unwrap();
     let shown = shown(&run);
     assert_eq!(shown["success_probability"], 0.75);
+    assert_eq!(shown["verdict"], "");
     assert_eq!(
         (&shown["checkpoint"], &shown["author"]),
         (&"stacking".into(), &"gctn_policy".into())
@@ -279,17 +284,44 @@ fn who_made_a_proposal_and_how_likely_it_succeeds_is_shown() {
 }
 
 #[test]
+fn a_goal_that_looks_reached_and_a_policy_that_does_not_know_are_shown() {
+    let mut run = proposed();
+    let mut number = 7;
+    let mut verdict = |success: Option<f32>, done: Option<f32>| {
+        number += 1;
+        let made = Proposal {
+            success_probability: success,
+            done_probability: done,
+            ..proposal(number, 1, 0, 10)
+        };
+        run.on_proposal(made).unwrap();
+        let shown = serde_json::to_value(run.snapshot(NOW)).unwrap();
+        shown["proposal"]["verdict"].as_str().unwrap().to_owned()
+    };
+    assert_eq!(
+        verdict(Some(0.9), Some(0.8)),
+        "the goal of this step looks reached already"
+    );
+    assert_eq!(
+        verdict(Some(0.1), Some(0.2)),
+        "the policy does not know how to reach the goal"
+    );
+    assert_eq!(verdict(Some(0.9), Some(0.2)), "");
+    assert_eq!(verdict(None, None), "");
+}
+
+#[test]
 fn a_rejected_proposal_is_not_open_when_it_is_published_again() {
     let mut run = proposed();
     run.on_confirmation(&confirmation(7, Decision::Reject), NOW);
     run.on_result(&result(7, StepOutcome::Rejected, 10), NOW);
     run.on_proposal(proposal(7, 1, 0, 10)).unwrap();
-    assert_eq!(run.phase(), Phase::AwaitingProposal);
+    assert_eq!(run.phase(), RunPhase::AwaitingProposal);
     run.on_goal(goal(1, 1, 0), NOW).unwrap();
     run.on_proposal(proposal(8, 1, 1, 10)).unwrap();
     assert_eq!(
         (run.phase(), run.current_id()),
-        (Phase::Proposed, Some(id(8)))
+        (RunPhase::Proposed, Some(id(8)))
     );
 }
 
@@ -298,15 +330,15 @@ fn a_stop_holds_until_a_goal_is_latched_again() {
     let mut run = proposed();
     run.on_confirmation(&confirmation(7, Decision::Approve), NOW);
     run.on_confirmation(&confirmation(7, Decision::Stop), NOW);
-    assert_eq!(run.phase(), Phase::Stopped);
+    assert_eq!(run.phase(), RunPhase::Stopped);
     run.on_result(&result(7, StepOutcome::Stopped, 15), NOW);
-    assert_eq!(run.phase(), Phase::Stopped);
+    assert_eq!(run.phase(), RunPhase::Stopped);
     run.check(Decision::Approve, NOW).unwrap_err();
     // The same goal latched once more is no new one.
     run.on_goal(goal(1, 0, 0), NOW).unwrap();
-    assert_eq!(run.phase(), Phase::Stopped);
+    assert_eq!(run.phase(), RunPhase::Stopped);
     run.on_goal(goal(1, 1, 15), NOW).unwrap();
-    assert_eq!(run.phase(), Phase::AwaitingProposal);
+    assert_eq!(run.phase(), RunPhase::AwaitingProposal);
 }
 
 #[test]
@@ -314,7 +346,7 @@ fn after_a_fault_the_step_can_be_tried_again() {
     let mut run = proposed();
     run.on_confirmation(&confirmation(7, Decision::Approve), NOW);
     run.on_result(&result(7, StepOutcome::Fault, 15), NOW);
-    assert_eq!(run.phase(), Phase::Fault);
+    assert_eq!(run.phase(), RunPhase::Fault);
     run.check(Decision::Retry, NOW).unwrap();
     let json = serde_json::to_value(run.snapshot(NOW)).unwrap();
     assert!(
@@ -322,6 +354,22 @@ fn after_a_fault_the_step_can_be_tried_again() {
             .as_str()
             .unwrap()
             .contains("For a reason.")
+    );
+}
+
+#[test]
+fn images_of_a_driver_with_other_names_are_watched_too() {
+    let mut run = proposed();
+    let image = "in messages=9 rate_hz=1.0 age_s=3.5 dropped=0 errors=0";
+    let late = NodeReport {
+        values: vec![("/front/depth/depth_registered".into(), image.into())],
+        ..report("/camera_fusion", "topics", "all messages arrive whole")
+    };
+    run.on_report(late, NOW);
+    let refusal = run.check(Decision::Approve, NOW).unwrap_err();
+    assert!(
+        refusal.reason.contains("front/depth/depth_registered"),
+        "{refusal:?}"
     );
 }
 
@@ -380,7 +428,7 @@ fn a_message_that_cannot_be_shown_is_named_by_its_field_and_changes_nothing() {
     assert!(error.contains("1048577 bytes"), "{error}");
     assert_eq!(
         (run.phase(), run.current_id()),
-        (Phase::Proposed, Some(id(7)))
+        (RunPhase::Proposed, Some(id(7)))
     );
 }
 
@@ -422,7 +470,7 @@ fn a_correction_is_a_proposal_for_the_present_goal_from_the_newest_view() {
     run.on_proposal(corrected).unwrap();
     assert_eq!(
         (run.phase(), run.current_id()),
-        (Phase::Proposed, Some(corrected_id))
+        (RunPhase::Proposed, Some(corrected_id))
     );
     // The same one again would be taken for a repetition.
     run.correction(pose(0.1, 0.0), pose(0.2, 0.5), "Ada")
@@ -448,7 +496,7 @@ fn a_correction_is_a_proposal_for_the_present_goal_from_the_newest_view() {
     run.on_proposal(proposal(9, 1, 0, 21)).unwrap();
     assert_eq!(
         (run.phase(), run.current_id()),
-        (Phase::AwaitingConfirmation, Some(corrected_id))
+        (RunPhase::AwaitingConfirmation, Some(corrected_id))
     );
 }
 
@@ -459,7 +507,7 @@ fn a_stop_without_a_proposal_ends_the_run_without_a_refusal() {
     run.on_goal(goal(1, 0, 0), NOW).unwrap();
     run.on_confirmation(&confirmation(0, Decision::Stop), NOW);
     run.on_result(&result(0, StepOutcome::Refused, 10), NOW);
-    assert_eq!(run.phase(), Phase::Stopped);
+    assert_eq!(run.phase(), RunPhase::Stopped);
     let json = serde_json::to_value(run.snapshot(NOW)).unwrap();
     assert_eq!(json["notices"].as_array().unwrap().len(), 0);
 }
@@ -510,13 +558,13 @@ fn a_demonstration_that_is_repeated_before_a_motion_was_confirmed_begins_anew() 
     let mut run = proposed();
     run.on_confirmation(&confirmation(7, Decision::Approve), NOW);
     run.on_result(&result(7, StepOutcome::Placed, 20), NOW);
-    assert_eq!(run.phase(), Phase::AwaitingConfirmation);
+    assert_eq!(run.phase(), RunPhase::AwaitingConfirmation);
     run.on_goal(goal(1, 0, 20), NOW).unwrap();
-    assert_eq!(run.phase(), Phase::AwaitingProposal);
+    assert_eq!(run.phase(), RunPhase::AwaitingProposal);
     run.on_proposal(proposal(8, 1, 0, 21)).unwrap();
     assert_eq!(
         (run.phase(), run.current_id()),
-        (Phase::Proposed, Some(id(8)))
+        (RunPhase::Proposed, Some(id(8)))
     );
 }
 
@@ -536,43 +584,101 @@ fn without_an_executor_the_words_say_so() {
 #[test]
 fn an_approval_that_the_executor_does_not_carry_out_is_asked_for_again() {
     let mut run = proposed();
-    let later = |run: &mut Run, seconds, motion: &str| {
+    let later = |run: &mut Run, seconds, moves| {
         let now = NOW + Duration::from_secs(seconds);
-        run.on_report(report("/suction_executor", "topics", "all well"), now);
-        run.on_report(report("/suction_executor", "motion", motion), now);
+        run.on_motion(moves, now);
         run.ask_again(now)
     };
     run.on_confirmation(&confirmation(7, Decision::Approve), NOW);
-    assert!(!later(&mut run, 1, "at rest"));
-    assert!(!later(&mut run, 20, "carries out proposal 7"));
-    assert_eq!(run.phase(), Phase::Moving);
-    assert!(later(&mut run, 30, "at rest"));
-    assert_eq!(run.phase(), Phase::Proposed);
+    assert_eq!(later(&mut run, 1, false), None);
+    // The arm moves for 20 s; its result comes a little after its end.
+    for seconds in 2..20 {
+        assert_eq!(later(&mut run, seconds, true), None);
+    }
+    assert_eq!(later(&mut run, 22, false), None);
+    assert_eq!(run.phase(), RunPhase::Moving);
+    assert_eq!(later(&mut run, 30, false), Some(id(7)));
+    assert_eq!(run.phase(), RunPhase::Proposed);
     let json = serde_json::to_value(run.snapshot(NOW)).unwrap();
     let reason = json["notices"][0]["reason"].as_str().unwrap();
     assert!(reason.contains("not answered the approval"), "{reason}");
-    assert!(!later(&mut run, 40, "at rest"));
+    assert_eq!(later(&mut run, 40, false), None);
 }
 
 #[test]
 fn a_decision_that_the_oracle_does_not_answer_is_asked_for_again() {
-    let late = NOW + Duration::from_secs(6);
+    let late = NOW + Duration::from_secs(7);
     let mut run = proposed();
     run.on_confirmation(&confirmation(7, Decision::Reject), NOW);
     run.on_result(&result(7, StepOutcome::Rejected, 11), NOW);
-    assert!(run.ask_again(late));
-    assert_eq!(run.phase(), Phase::Proposed);
+    assert_eq!(run.ask_again(late), Some(id(7)));
+    assert_eq!(run.phase(), RunPhase::Proposed);
 
     let mut run = proposed();
     run.on_confirmation(&confirmation(7, Decision::Approve), NOW);
     run.on_result(&result(7, StepOutcome::Placed, 20), NOW);
-    assert!(!run.ask_again(late));
+    assert_eq!(run.ask_again(late), None);
     run.on_confirmation(&confirmation(7, Decision::Advance), NOW);
-    assert_eq!(run.phase(), Phase::AwaitingProposal);
-    assert!(run.ask_again(late));
-    assert_eq!(run.phase(), Phase::AwaitingConfirmation);
+    assert_eq!(run.phase(), RunPhase::AwaitingProposal);
+    assert_eq!(run.ask_again(late), Some(id(7)));
+    assert_eq!(run.phase(), RunPhase::AwaitingConfirmation);
     // An answer is a goal.
     run.on_confirmation(&confirmation(7, Decision::Advance), NOW);
     run.on_goal(goal(2, 0, 20), NOW).unwrap();
-    assert!(!run.ask_again(late));
+    assert_eq!(run.ask_again(late), None);
+}
+
+#[test]
+fn a_result_that_comes_twice_is_one_step() {
+    let mut run = proposed();
+    run.on_confirmation(&confirmation(7, Decision::Approve), NOW);
+    for _ in 0..2 {
+        run.on_result(&result(7, StepOutcome::Placed, 20), NOW);
+    }
+    assert!(run.past_step(1).is_some() && run.past_step(2).is_none());
+    // Nor does it open a question that was answered.
+    run.on_confirmation(&confirmation(7, Decision::Advance), NOW);
+    run.on_result(&result(7, StepOutcome::Placed, 20), NOW);
+    assert_eq!(run.phase(), RunPhase::AwaitingProposal);
+}
+
+#[test]
+fn the_answer_to_a_rejection_that_the_console_has_repeated_by_itself_is_not_shown() {
+    let mut run = proposed();
+    run.on_confirmation(&confirmation(7, Decision::Approve), NOW);
+    run.on_result(&refused(7, Some(ProposalStatus::Superseded)), NOW);
+    let later = |seconds| NOW + Duration::from_secs(seconds);
+    assert_eq!(run.probe(later(0)), None);
+    assert_eq!(run.probe(later(11)), Some(id(7)));
+    run.on_result(&refused(7, Some(ProposalStatus::Superseded)), later(12));
+    let json = serde_json::to_value(run.snapshot(NOW)).unwrap();
+    assert_eq!(json["notices"].as_array().unwrap().len(), 1);
+}
+
+#[test]
+fn joints_are_taken_ten_times_a_second_and_shown_while_the_arm_moves() {
+    let mut run = proposed();
+    let joints = |run: &mut Run, milliseconds, position_rad| {
+        let now = NOW + Duration::from_millis(milliseconds);
+        run.on_joints(vec!["elbow".into()], vec![position_rad], now)
+    };
+    assert!(!joints(&mut run, 200, 1.0), "nothing moves");
+    run.on_confirmation(&confirmation(7, Decision::Approve), NOW);
+    assert!(!joints(&mut run, 250, 2.0), "too soon");
+    let shown = |run: &Run| {
+        let json = serde_json::to_value(run.snapshot(NOW)).unwrap();
+        json["joints"]["elbow"].as_f64().unwrap()
+    };
+    assert_eq!(shown(&run), 1.0);
+    assert!(joints(&mut run, 300, 3.0));
+    assert_eq!(shown(&run), 3.0);
+}
+
+#[test]
+fn viewers_are_told_at_once_when_something_is_held_or_lost() {
+    let mut run = fresh();
+    assert!(!run.on_pins(Some(true), None));
+    assert!(run.on_pins(Some(true), Some(true)));
+    assert!(!run.on_pins(Some(false), Some(true)));
+    assert!(run.on_pins(Some(false), Some(false)));
 }

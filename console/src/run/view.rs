@@ -5,7 +5,7 @@ use std::time::Duration;
 
 use heightmap::{Change, ChangeRules, Heightmap, largest_change};
 use nalgebra::Point2;
-use step_protocol::{Coverage, Observation};
+use step_protocol::{Coverage, Observation, ProposalId};
 
 use super::Run;
 
@@ -64,28 +64,51 @@ pub(super) enum TableChange {
     Workspace,
 }
 
+/// How the table differed from the heightmap that a proposal was made from, when it was looked at last.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Compared {
+    proposal_id: ProposalId,
+    /// Number of the heightmap that it was compared with.
+    view: u64,
+    pub(super) change: Option<TableChange>,
+}
+
 impl Run {
-    /// What has changed since the heightmap that the newest proposal was made from.
+    /// What has changed since the heightmap that the present proposal was made from. Where that one is not known any more, the
+    /// change is the one that was found last.
     pub(super) fn compare(&mut self) {
-        let (Some(id), Some(newest)) = (self.newest, self.views.back()) else {
+        let (Some(proposal), Some(newest)) = (self.operator.current(), self.views.back()) else {
             return;
         };
-        let rules = &self.watch.changes;
-        let Some(offered) = self
-            .offered
-            .iter_mut()
-            .rfind(|known| known.proposal.id == id)
-        else {
+        let before = self
+            .compared
+            .filter(|known| known.proposal_id == proposal.id);
+        if before.is_some_and(|known| known.view == newest.number) {
             return;
+        }
+        let mut views = self.views.iter();
+        let change = match views.rfind(|view| view.stamp == proposal.stamp) {
+            Some(source) => {
+                let action = &proposal.action;
+                let around =
+                    [&action.pick, &action.place].map(|pose| Point2::from(pose.translation.vector));
+                table_change(source, newest, &self.watch.changes, &around)
+            }
+            None => before.and_then(|known| known.change),
         };
-        let stamp = offered.proposal.stamp;
-        let Some(source) = self.views.iter().rfind(|view| view.stamp == stamp) else {
-            return;
-        };
-        let action = &offered.proposal.action;
-        let around =
-            [&action.pick, &action.place].map(|pose| Point2::from(pose.translation.vector));
-        offered.change = table_change(source, newest, rules, &around);
+        self.compared = Some(Compared {
+            proposal_id: proposal.id,
+            view: newest.number,
+            change,
+        });
+    }
+
+    /// How the table differs from what the present proposal was made from.
+    pub(super) fn present_change(&self) -> Option<TableChange> {
+        let id = self.current_id()?;
+        self.compared
+            .filter(|known| known.proposal_id == id)?
+            .change
     }
 }
 

@@ -1,6 +1,10 @@
-//! Who may ask, and what an answer is that is none.
+//! Authentication, and the responses to requests that fail.
 
+use std::fs::OpenOptions;
+use std::io::Write as _;
 use std::net::SocketAddr;
+use std::os::unix::fs::OpenOptionsExt as _;
+use std::path::Path;
 use std::time::Duration;
 
 use axum::extract::rejection::JsonRejection;
@@ -21,19 +25,42 @@ use crate::refusal::Refusal;
 use crate::session::ViewerId;
 use crate::state::State;
 
+/// Shortest token that is accepted.
+const SHORTEST_TOKEN: usize = 16;
+
 /// Header with a viewer's key.
 const SESSION: HeaderName = HeaderName::from_static("x-session");
+
+/// A token that can be guessed, or cannot stand in an address.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, thiserror::Error)]
+#[error("expected at least {SHORTEST_TOKEN} letters, digits, or characters of -_.~ (or nothing)")]
+pub struct InvalidToken;
 
 /// Who may ask.
 #[derive(Clone, Debug)]
 pub struct Access {
     token: String,
+    address: SocketAddr,
     scheme: &'static str,
     /// `Host` headers by which this server is meant.
     hosts: Vec<String>,
 }
 
 impl Access {
+    /// Checks a token that a person has chosen; an empty one stands for a drawn one.
+    ///
+    /// # Errors
+    /// When it can be guessed, or cannot stand in an address.
+    pub fn check(token: &str) -> Result<(), InvalidToken> {
+        let good =
+            |character: char| character.is_ascii_alphanumeric() || "-_.~".contains(character);
+        let is_long = token.len() >= SHORTEST_TOKEN;
+        match token.is_empty() || (is_long && token.chars().all(good)) {
+            true => Ok(()),
+            false => Err(InvalidToken),
+        }
+    }
+
     /// For a server on `address`, reached as its IP address, as localhost where it is a loopback one, and by `names`.
     pub fn new(token: String, address: SocketAddr, names: &[String], tls: bool) -> Self {
         let port = address.port();
@@ -53,9 +80,34 @@ impl Access {
         }
         Self {
             token,
+            address,
             scheme,
             hosts,
         }
+    }
+
+    /// Where the page is served, without the token: for logs.
+    pub fn address(&self) -> String {
+        format!("{}://{}/", self.scheme, self.address)
+    }
+
+    /// The page's address with the token: who opens it may decide.
+    pub fn page(&self) -> String {
+        format!("{}#token={}", self.address(), self.token)
+    }
+
+    /// Writes the page's address with the token to a file: whole or not at all, for the owner alone.
+    ///
+    /// # Errors
+    /// When it cannot be written.
+    pub fn write_page(&self, path: &Path) -> std::io::Result<()> {
+        let mut partial = path.as_os_str().to_owned();
+        partial.push(".partial");
+        let mut options = OpenOptions::new();
+        options.write(true).create(true).truncate(true).mode(0o600);
+        let mut file = options.open(&partial)?;
+        writeln!(file, "{}", self.page())?;
+        std::fs::rename(&partial, path)
     }
 
     fn knows_host(&self, host: &str) -> bool {
@@ -110,7 +162,7 @@ impl Access {
     }
 }
 
-/// An answer that is none: status, and words for a person.
+/// The response to a request that failed: HTTP status, and a message for a person.
 #[derive(Debug)]
 pub(super) struct Failure {
     status: StatusCode,
@@ -263,5 +315,39 @@ impl FromRequestParts<Shared> for By {
                 "Join again with your name.",
             )
         })
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use std::os::unix::fs::PermissionsExt as _;
+
+    use super::*;
+
+    #[test]
+    fn the_address_with_the_token_is_written_for_the_owner_alone() {
+        let folder = tempfile::tempdir().unwrap();
+        let address = "127.0.0.1:8750".parse().unwrap();
+        let access = Access::new("0123456789abcdef".into(), address, &[], true);
+        let path = folder.path().join("address");
+        access.write_page(&path).unwrap();
+        let page = "https://127.0.0.1:8750/#token=0123456789abcdef";
+        assert_eq!(std::fs::read_to_string(&path).unwrap(), format!("{page}\n"));
+        let mode = path.metadata().unwrap().permissions().mode();
+        assert_eq!(mode & 0o777, 0o600);
+        assert!(!access.address().contains("0123"));
+        access
+            .write_page(&folder.path().join("no/such/folder"))
+            .unwrap_err();
+    }
+
+    #[test]
+    fn a_token_that_can_be_guessed_or_cannot_stand_in_an_address_is_refused() {
+        for token in ["secret", "sixteen characters", "sixteen#characters"] {
+            assert_eq!(Access::check(token), Err(InvalidToken), "{token}");
+        }
+        for token in ["", "0123456789-_.~ab"] {
+            assert_eq!(Access::check(token), Ok(()), "{token}");
+        }
     }
 }

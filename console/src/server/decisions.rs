@@ -5,7 +5,7 @@ use axum::http::StatusCode;
 use axum::http::header::CONTENT_TYPE;
 use axum::response::{IntoResponse, Response};
 use serde::{Deserialize, Serialize};
-use step_protocol::ProposalId;
+use step_protocol::{ProposalId, Recovery};
 
 use super::Shared;
 use super::access::{Answer, Body, By, Failure};
@@ -70,7 +70,15 @@ pub(super) async fn correct(
 }
 
 pub(super) async fn home(by: By) -> Answer {
-    by.change(StatusCode::ACCEPTED, |state, _| state.home(by.viewer))
+    by.change(StatusCode::ACCEPTED, |state, _| {
+        state.recover(by.viewer, Recovery::Home)
+    })
+}
+
+pub(super) async fn put_down(by: By) -> Answer {
+    by.change(StatusCode::ACCEPTED, |state, _| {
+        state.recover(by.viewer, Recovery::PutDown)
+    })
 }
 
 #[derive(Deserialize)]

@@ -17,7 +17,7 @@ const TOKEN: &str = "0123456789abcdef";
 const HOST_NAME: &str = "127.0.0.1:8750";
 
 /// A page whose files lie in a folder.
-fn page(console: Console, folder: &Path) -> Page {
+pub(crate) fn page(console: Console, folder: &Path) -> Page {
     let trainings = Trainings::new(
         "no/such/program".into(),
         "recipe".into(),

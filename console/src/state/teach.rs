@@ -4,13 +4,13 @@ use std::time::Duration;
 
 use bags::Demonstration;
 use pick_place::PrimitiveSettings;
-use step_protocol::{OperatorDecision, ProposalId};
+use step_protocol::{OperatorDecision, ProposalId, RunPhase};
 
 use super::{Command, State};
 use crate::lesson::Lesson;
 use crate::preview::Motion;
-use crate::refusal::{Refusal, advice};
-use crate::run::{Phase, Pose};
+use crate::refusal::{Refusal, advice_on};
+use crate::run::Pose;
 use crate::session::ViewerId;
 
 /// The executor plans a motion in this time.
@@ -30,7 +30,7 @@ impl State {
     pub fn begin_lesson(&mut self, viewer: ViewerId) -> Result<(), Refusal> {
         self.sessions.check_operator(viewer)?;
         self.check_no_lesson()?;
-        if self.run.phase() == Phase::Moving {
+        if self.run.phase() == RunPhase::Moving {
             return Err(Refusal::new("The arm is moving.", "Wait until it is back."));
         }
         self.lesson = Some(Lesson::default());
@@ -162,7 +162,7 @@ impl State {
         } else {
             let refusal = Refusal::new(
                 format!("The motion cannot be planned: {reason}."),
-                advice(&reason),
+                advice_on(&reason),
             );
             self.forget_trial(refusal, now);
         }

@@ -106,15 +106,16 @@ pub(crate) fn with_everything() -> Console {
             ..NodeReport::default()
         };
         state.run.on_report(report, now);
+        let later = now + Duration::from_secs(1);
         state
             .run
-            .on_joints(vec!["elbow_joint".into()], vec![1.0], now);
+            .on_joints(vec!["elbow_joint".into()], vec![1.0], later);
         state.policy = Some(PolicyState {
             checkpoint: "new.safetensors".into(),
             previous: "old.safetensors".into(),
         });
         state.begin_lesson(ada).unwrap();
-        state.on_home(ProposalId(9), true);
+        state.on_recovery(Recovery::Home, ProposalId(9), true);
         state.on_planned_motion(planned(9), now);
         state.lesson_saved();
     });
@@ -180,7 +181,11 @@ fn everybody_may_stop_and_only_the_operator_does_anything_else() {
     let (console, _, mut commands) = proposed();
     let bob = console.change(|state, now| state.sessions.join("Bob", "b".into(), now).unwrap());
     assert!(decide(&console, bob, 7, Decision::Approve).is_err());
-    assert!(console.change(|state, _| state.home(bob)).is_err());
+    assert!(
+        console
+            .change(|state, _| state.recover(bob, Recovery::Home))
+            .is_err()
+    );
     assert!(console.change(|state, _| state.set_step(bob, 1)).is_err());
     assert!(commands.try_recv().is_err());
     decide(&console, bob, 0, Decision::Stop).unwrap();
@@ -441,9 +446,12 @@ fn a_shown_step_is_changed_stopped_and_proposed_again_when_another_proposal_supe
 #[test]
 fn the_way_home_is_shown_and_moves_only_when_the_operator_approves_it() {
     let (console, ada, mut commands) = proposed();
-    console.change(|state, _| state.home(ada)).unwrap();
-    assert_eq!(commands.try_recv().unwrap(), Command::Home("Ada".into()));
-    console.change(|state, _| state.on_home(ProposalId(9), true));
+    console
+        .change(|state, _| state.recover(ada, Recovery::Home))
+        .unwrap();
+    let asked = Command::Recover(Recovery::Home, "Ada".into());
+    assert_eq!(commands.try_recv().unwrap(), asked);
+    console.change(|state, _| state.on_recovery(Recovery::Home, ProposalId(9), true));
     let refusal = decide(&console, ada, 9, Decision::Approve).unwrap_err();
     assert!(refusal.reason.contains("not been shown"), "{refusal:?}");
     console.change(|state, now| state.on_planned_motion(planned(9), now));
@@ -457,7 +465,7 @@ fn the_way_home_is_shown_and_moves_only_when_the_operator_approves_it() {
     assert_eq!(pending(), Some(7));
     decide(&console, ada, 9, Decision::Approve).unwrap_err();
     assert!(commands.try_recv().is_err());
-    console.change(|state, _| state.on_home(ProposalId(9), true));
+    console.change(|state, _| state.on_recovery(Recovery::Home, ProposalId(9), true));
     decide(&console, ada, 9, Decision::Approve).unwrap();
     let Ok(Command::Confirm(approval)) = commands.try_recv() else {
         panic!("expected an approval");
@@ -471,9 +479,39 @@ fn the_way_home_is_shown_and_moves_only_when_the_operator_approves_it() {
     console.change(|state, now| state.on_result(&at_home, now));
     assert_eq!(home(), None);
     // A stop withdraws it.
-    console.change(|state, _| state.on_home(ProposalId(10), true));
+    console.change(|state, _| state.on_recovery(Recovery::Home, ProposalId(10), true));
     decide(&console, bob, 0, Decision::Stop).unwrap();
     assert_eq!(home(), None);
+}
+
+#[test]
+fn what_is_held_is_put_down_only_when_the_operator_approves_it_and_only_while_something_is_held() {
+    let (console, ada, mut commands) = proposed();
+    let put_down = || console.change(|state, _| state.recover(ada, Recovery::PutDown));
+    let refusal = put_down().unwrap_err();
+    assert!(refusal.reason.contains("holds nothing"), "{refusal:?}");
+    console.change(|state, _| state.run.on_pins(None, Some(true)));
+    put_down().unwrap();
+    let asked = Command::Recover(Recovery::PutDown, "Ada".into());
+    assert_eq!(commands.try_recv().unwrap(), asked);
+    // Where it cannot be planned, there is nothing to approve.
+    console.change(|state, now| {
+        state.on_recovery(Recovery::PutDown, ProposalId(9), true);
+        state.on_planned_motion(unplanned(9, "putting down: something stands there"), now);
+    });
+    let refusal = decide(&console, ada, 9, Decision::Approve).unwrap_err();
+    assert!(refusal.reason.contains("cannot be put down"), "{refusal:?}");
+    assert!(commands.try_recv().is_err());
+    console.change(|state, now| {
+        state.on_recovery(Recovery::PutDown, ProposalId(10), true);
+        state.on_planned_motion(planned(10), now);
+    });
+    decide(&console, ada, 10, Decision::Approve).unwrap();
+    let Ok(Command::Confirm(approval)) = commands.try_recv() else {
+        panic!("expected an approval");
+    };
+    let expected = (ProposalId(10), OperatorDecision::Approve);
+    assert_eq!((approval.proposal_id, approval.decision), expected);
 }
 
 #[test]
@@ -562,4 +600,117 @@ fn a_correction_that_the_operator_confirms_is_kept_once_as_a_demonstration_of_on
     assert_eq!(libraries.corrections.list()[0].name, name);
     let picture = libraries.holding(&name).picture(&name, 1).unwrap();
     assert_eq!(picture.height_m, [0.5]);
+}
+
+#[test]
+fn what_the_graph_answers_is_said_and_a_stopped_run_that_goes_on_is_shown_so() {
+    let (console, ada, mut commands) = proposed();
+    let noted = || {
+        let json: serde_json::Value =
+            serde_json::from_str(&console.snapshot(None).unwrap()).unwrap();
+        let notices = json["notices"].as_array().unwrap();
+        notices.last().unwrap()["reason"]
+            .as_str()
+            .unwrap()
+            .to_owned()
+    };
+    decide(&console, ada, 7, Decision::Stop).unwrap();
+    assert!(matches!(commands.try_recv(), Ok(Command::Confirm(_))));
+    let phase = || console.read(|state, _| state.run.phase());
+    console.change(|state, now| state.on_set_step_answer(Err("no such step".into()), now));
+    assert!(noted().contains("no such step"));
+    assert_eq!(phase(), RunPhase::Stopped);
+    // The oracle has not heard of the stop: no other goal comes.
+    console.change(|state, now| state.on_set_step_answer(Ok(()), now));
+    assert_eq!(phase(), RunPhase::Proposed);
+
+    let busy = || Err("the arm is on its way home".to_owned());
+    console.change(|state, now| state.on_recovery_answer(Recovery::Home, busy(), now));
+    assert!(noted().contains("There is no way home"));
+    let proposed = Ok((ProposalId(9), true));
+    console.change(|state, now| state.on_recovery_answer(Recovery::Home, proposed, now));
+    assert_eq!(
+        console.read(|state, _| state.home.unwrap().proposal_id),
+        ProposalId(9)
+    );
+
+    let path = std::path::Path::new("policies/new.safetensors");
+    let missing = || Err("no such file".to_owned());
+    console.change(|state, now| state.on_checkpoint_answer(path, missing(), now));
+    assert!(noted().contains("kept its checkpoint: no such file"));
+    let policy = PolicyState {
+        checkpoint: "policies/new.safetensors".into(),
+        previous: "old".into(),
+    };
+    console.change(|state, now| state.on_checkpoint_answer(path, Ok(policy.clone()), now));
+    assert!(noted().contains("uses new from"));
+    assert_eq!(console.read(|state, _| state.policy.clone()), Some(policy));
+
+    let goals = || Some("blocks/0".to_owned());
+    let not_found = Err("not found".to_owned());
+    console.change(|state, now| state.on_load_answer("blocks".into(), goals(), not_found, now));
+    assert!(noted().contains("not loaded: not found"));
+    assert_eq!(console.read(|state, _| state.repetition.clone()), None);
+    let loaded = Ok("blocks, 1 step".to_owned());
+    console.change(|state, now| state.on_load_answer("blocks".into(), goals(), loaded, now));
+    assert!(noted().contains("repeats blocks, 1 step."));
+    assert!(console.read(|state, _| state.repetition.is_some()));
+}
+
+#[test]
+fn a_recovery_is_called_for_again_where_the_executor_has_not_heard_of_the_operator() {
+    let (console, _, _commands) = proposed();
+    let unheard = |reason: &str| {
+        let answer: Answer<()> = Err(reason.to_owned());
+        console.read(|state, now| state.is_presence_unheard(&answer, now))
+    };
+    assert!(unheard("no operator is present (require_presence)"));
+    assert!(!unheard("the arm is on its way home"));
+    // Then it is right.
+    let late = |state: &State, now| {
+        let answer: Answer<()> = Err("no operator is present (require_presence)".to_owned());
+        state.is_presence_unheard(&answer, now + Duration::from_secs(5))
+    };
+    assert!(!console.read(late));
+}
+
+#[test]
+fn a_way_home_whose_approval_is_not_answered_is_shown_again() {
+    let (console, ada, mut commands) = proposed();
+    console.change(|state, now| {
+        state.on_recovery(Recovery::Home, ProposalId(9), true);
+        state.on_planned_motion(planned(9), now);
+    });
+    decide(&console, ada, 9, Decision::Approve).unwrap();
+    assert!(matches!(commands.try_recv(), Ok(Command::Confirm(_))));
+    let later =
+        |seconds| console.change(|state, now| state.ask_again(now + Duration::from_secs(seconds)));
+    let is_approved = || console.read(|state, _| state.home.unwrap().approved);
+    assert!(!later(1));
+    assert!(is_approved());
+    assert!(later(7));
+    assert!(!is_approved());
+}
+
+#[test]
+fn where_nothing_follows_the_console_rejects_once_more_for_an_operator_only() {
+    let (console, ada, mut commands) = proposed();
+    let superseded = StepResult {
+        status: Some(ProposalStatus::Superseded),
+        ..result(ProposalId(7), StepOutcome::Refused, 0)
+    };
+    console.change(|state, now| state.on_result(&superseded, now));
+    let later =
+        |seconds| console.change(|state, now| state.ask_again(now + Duration::from_secs(seconds)));
+    later(0);
+    assert!(commands.try_recv().is_err());
+    later(11);
+    let Ok(Command::Confirm(rejection)) = commands.try_recv() else {
+        panic!("expected a rejection");
+    };
+    let expected = (ProposalId(7), OperatorDecision::Reject);
+    assert_eq!((rejection.proposal_id, rejection.decision), expected);
+    console.change(|state, _| state.sessions.leave(ada));
+    later(30);
+    assert!(commands.try_recv().is_err());
 }

@@ -23,7 +23,7 @@ pub struct Board {
     pub first_id: usize,
 }
 
-/// A board that cannot be.
+/// A dimension of the board is out of range.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 #[error("board.{field} is {value}, expected {expected}")]
 pub struct BoardError {
@@ -95,6 +95,12 @@ impl Board {
             [(0.0, 0.0), (t, 0.0), (t, t), (0.0, t)]
                 .map(|(dx, dy)| Point3::new(x_m + dx, y_m + dy, 0.0)),
         )
+    }
+
+    /// The middle of the board in its frame.
+    pub fn middle(&self) -> Point3<f64> {
+        let half = |count: usize| 0.5 * (count as f64 * (self.tag_m + self.gap_m) - self.gap_m);
+        Point3::new(half(self.cols), half(self.rows), 0.0)
     }
 
     /// Whether the board is white at a point of its plane. None beyond its edge, half a gap (and at least a module) around the tags.

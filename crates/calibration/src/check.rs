@@ -1,10 +1,11 @@
-//! What is to be said of the cameras of a cell from frames of its empty, still table.
+//! What is to be said of the cameras of a cell from frames of its empty, still table, with or without a board on it.
 
+use crate::{Board, GrayImage, board_pose, detect, gray_pixels};
 use heightmap::{
-    Camera, ChangeRules, FusionError, Heightmap, OtherWorkspace, StillFusion, StillSettings, View,
-    Workspace, largest_change,
+    Camera, ChangeRules, Fusion, FusionError, Heightmap, OtherWorkspace, StillFusion,
+    StillSettings, View, Workspace, largest_change,
 };
-use nalgebra::{Matrix3, Vector3};
+use nalgebra::{Isometry3, Matrix3, Vector3};
 
 /// Colour and registered depth of one camera at one time.
 #[derive(Clone, Debug, PartialEq)]
@@ -58,6 +59,10 @@ pub struct CheckLimits {
     pub height_mm: f64,
     /// Median difference of the heights that two cameras see.
     pub offset_mm: f64,
+    /// Distance of the middles of the board as two cameras see it.
+    pub board_mm: f64,
+    /// Angle between the boards that two cameras see.
+    pub board_deg: f64,
     /// Share of the cells that are seen.
     pub fill: f64,
     /// Heights of 99.9 % of the cells that change between two heightmaps of the same scene: what the gate takes for noise.
@@ -70,6 +75,8 @@ impl Default for CheckLimits {
             tilt_deg: 0.4,
             height_mm: 4.0,
             offset_mm: 3.0,
+            board_mm: 3.0,
+            board_deg: 0.35,
             fill: 0.98,
             noise_mm: 1e3 * ChangeRules::default().near.height_m,
         }
@@ -102,8 +109,9 @@ const TABLE_M: f32 = 0.03;
 /// The workspace of the check reaches down this far, so that a table that is too low is seen.
 const DOWN_M: f64 = -0.04;
 
-/// Measures plane, offsets, fill rate and noise. `frames` are by camera, at least twice as many as the median takes; the arm must be out of
-/// sight and the table mostly empty.
+/// Measures plane, offsets, fill rate and noise. `frames` are by camera, at least twice as many as the fusion takes for a heightmap; the arm must
+/// be out of sight and the table mostly empty. `still` is how the fusion takes the median, nothing where each set of images is a heightmap.
+/// Where two cameras see the board, lying anywhere, they are compared by it: an empty table looks the same to a camera that stands too far aside.
 ///
 /// # Errors
 /// When a camera has too few frames, or frames of another size.
@@ -111,10 +119,12 @@ pub fn check_cameras(
     cameras: &[Camera],
     frames: &[Vec<Frame>],
     workspace: &Workspace,
-    settings: &StillSettings,
+    still: Option<&StillSettings>,
+    board: &Board,
     limits: &CheckLimits,
 ) -> Result<Vec<Measure>, CheckError> {
-    let expected = 2 * settings.frames;
+    let count = still.map_or(1, |settings| settings.frames);
+    let expected = 2 * count;
     for (camera, frames) in cameras.iter().zip(frames) {
         if frames.len() < expected {
             return Err(CheckError::Frames {
@@ -131,11 +141,11 @@ pub fn check_cameras(
     let mut measures = Vec::new();
     let mut alone = Vec::new();
     for (camera, frames) in cameras.iter().zip(frames) {
-        let heightmap = median(
+        let heightmap = fuse(
             std::slice::from_ref(camera),
-            &[&frames[..settings.frames]],
+            &[&frames[..count]],
             &deep,
-            settings,
+            still,
         )?;
         let (tilt_deg, height_mm) =
             plane(&heightmap).map_or((f64::NAN, f64::NAN), |(normal, height_m)| {
@@ -175,14 +185,13 @@ pub fn check_cameras(
             });
         }
     }
+    measures.extend(compare_boards(cameras, frames, board, limits));
     let part = |from: usize| -> Vec<&[Frame]> {
-        let parts = frames
-            .iter()
-            .map(|frames| &frames[from..from + settings.frames]);
+        let parts = frames.iter().map(|frames| &frames[from..from + count]);
         parts.collect()
     };
-    let first = median(cameras, &part(0), workspace, settings)?;
-    let second = median(cameras, &part(settings.frames), workspace, settings)?;
+    let first = fuse(cameras, &part(0), workspace, still)?;
+    let second = fuse(cameras, &part(count), workspace, still)?;
     let seen = (0..workspace.len())
         .filter(|index| first.is_seen(*index))
         .count();
@@ -220,28 +229,84 @@ pub fn check_cameras(
     Ok(measures)
 }
 
-fn median(
+/// As the fusion does.
+fn fuse(
     cameras: &[Camera],
     frames: &[&[Frame]],
     workspace: &Workspace,
-    settings: &StillSettings,
+    still: Option<&StillSettings>,
 ) -> Result<Heightmap, FusionError> {
-    let mut fusion = StillFusion::new(*settings);
-    for index in 0..settings.frames {
-        let views: Vec<View<'_>> = cameras
-            .iter()
-            .zip(frames)
-            .map(|(camera, frames)| View {
-                camera,
-                rgb: &frames[index].rgb,
-                depth_m: &frames[index].depth_m,
-            })
-            .collect();
-        fusion.push(&views, workspace)?;
-    }
+    let views = |index: usize| -> Vec<View<'_>> {
+        let views = cameras.iter().zip(frames).map(|(camera, frames)| View {
+            camera,
+            rgb: &frames[index].rgb,
+            depth_m: &frames[index].depth_m,
+        });
+        views.collect()
+    };
     let mut heightmap = Heightmap::new(*workspace);
-    fusion.median(&mut heightmap);
+    match still {
+        None => {
+            Fusion::default().fuse(&views(0), &mut heightmap)?;
+        }
+        Some(settings) => {
+            let mut fusion = StillFusion::new(*settings);
+            for index in 0..settings.frames {
+                fusion.push(&views(index), workspace)?;
+            }
+            fusion.median(&mut heightmap);
+        }
+    }
     Ok(heightmap)
+}
+
+/// How far apart each two cameras see the board; nothing where they do not.
+fn compare_boards(
+    cameras: &[Camera],
+    frames: &[Vec<Frame>],
+    board: &Board,
+    limits: &CheckLimits,
+) -> Vec<Measure> {
+    let seen = cameras.iter().zip(frames).filter_map(|(camera, frames)| {
+        let pose = world_from_board(camera, frames, board)?;
+        Some((camera.name.as_str(), pose))
+    });
+    let seen: Vec<(&str, Isometry3<f64>)> = seen.collect();
+    let mut measures = Vec::new();
+    for (i, (first, a)) in seen.iter().enumerate() {
+        for (second, b) in &seen[i + 1..] {
+            let middle = board.middle();
+            let mut measure = |name, value, unit, limit| {
+                measures.push(Measure {
+                    name,
+                    subject: format!("{first} and {second}"),
+                    value,
+                    unit,
+                    limit: Limit::AtMost(limit),
+                });
+            };
+            let apart_mm = 1e3 * (a * middle - b * middle).norm();
+            measure("board", apart_mm, "mm", limits.board_mm);
+            let turned_deg = a.rotation.angle_to(&b.rotation).to_degrees();
+            measure("turn", turned_deg, "degrees", limits.board_deg);
+        }
+    }
+    measures
+}
+
+/// Where the board lies, by all frames of one camera together.
+fn world_from_board(camera: &Camera, frames: &[Frame], board: &Board) -> Option<Isometry3<f64>> {
+    let mut tags = Vec::new();
+    for frame in frames {
+        let pixels = gray_pixels(&frame.rgb);
+        tags.extend(detect(&GrayImage {
+            width: camera.intrinsics.width,
+            height: camera.intrinsics.height,
+            pixels: &pixels,
+        }));
+    }
+    let view = board_pose(board, &camera.intrinsics, &tags)?;
+    Some(camera.world_from_camera * view.camera_from_board)
 }
 
 /// Normal of the table (z up) and its height in the middle of the workspace, by least squares over its cells, those far off left out three times.
@@ -300,14 +365,32 @@ fn percentile(values: &mut [f64], share: f64) -> f64 {
 mod tests {
     use super::*;
     use camera_noise::{Perturbation, Rig};
-    use nalgebra::{Isometry3, Translation3, UnitQuaternion};
+    use nalgebra::{Translation3, UnitQuaternion};
+    use rand::{RngExt, SeedableRng};
+    use rand_chacha::ChaCha8Rng;
 
-    /// Frames of a plane, taken by cameras that stand elsewhere than they are believed to.
-    fn frames(real: &[Camera], noise: &Rig, count: usize) -> Vec<Vec<Frame>> {
-        let frame = |index: usize, camera: &Camera, frame: usize| {
+    /// The board on the table, in the middle of the workspace, as the cameras of Ravens all see it.
+    fn on_table() -> Isometry3<f64> {
+        Isometry3::from_parts(
+            Translation3::new(0.3, 0.1, 0.001),
+            UnitQuaternion::from_axis_angle(&Vector3::x_axis(), std::f64::consts::PI),
+        )
+    }
+
+    /// Frames of a table, taken by cameras that may stand elsewhere than they are believed to.
+    fn frames(
+        real: &[Camera],
+        noise: Option<&Rig>,
+        count: usize,
+        with_board: bool,
+    ) -> Vec<Vec<Frame>> {
+        let clean = |camera: &Camera| {
             let (width, height) = (camera.intrinsics.width, camera.intrinsics.height);
             let mut rgb = vec![110; 3 * width * height];
-            let mut depth_m: Vec<f32> = (0..width * height)
+            if with_board {
+                Board::A4.draw(camera, &on_table(), (200.0, 30.0), &mut rgb);
+            }
+            let depth_m = (0..width * height)
                 .map(|i| {
                     let ray = camera.intrinsics.ray(&nalgebra::Point2::new(
                         (i % width) as f64,
@@ -324,37 +407,45 @@ mod tests {
                     }
                 })
                 .collect();
-            noise.apply(
-                index,
-                &camera.intrinsics,
-                frame as u64,
-                &mut rgb,
-                &mut depth_m,
-            );
             Frame { rgb, depth_m }
         };
-        let cameras = real.iter().enumerate();
-        cameras
-            .map(|(index, camera)| (0..count).map(|n| frame(index, camera, n)).collect())
-            .collect()
+        let taken = |(index, camera): (usize, &Camera)| {
+            let clean = clean(camera);
+            let frame = |number: usize| {
+                let mut frame = clean.clone();
+                let Frame { rgb, depth_m } = &mut frame;
+                if let Some(noise) = noise {
+                    noise.apply(index, &camera.intrinsics, number as u64, rgb, depth_m);
+                }
+                frame
+            };
+            (0..count).map(frame).collect()
+        };
+        real.iter().enumerate().map(taken).collect()
     }
 
-    fn faults(believed: &[Camera], real: &[Camera]) -> Vec<String> {
+    fn realsense(real: &[Camera], seed: u64) -> Rig {
         let path = concat!(
             env!("CARGO_MANIFEST_DIR"),
             "/../../config/perturbations/realsense.yaml"
         );
-        let model = Perturbation::load(path.as_ref()).unwrap();
-        let noise = Rig::draw(&model, real, 4, 0);
-        let frames = frames(real, &noise, 10);
-        let measures = check_cameras(
+        Rig::draw(&Perturbation::load(path.as_ref()).unwrap(), real, seed, 0)
+    }
+
+    fn measures(believed: &[Camera], frames: &[Vec<Frame>]) -> Vec<Measure> {
+        check_cameras(
             believed,
-            &frames,
+            frames,
             &Workspace::RAVENS,
-            &StillSettings::default(),
+            Some(&StillSettings::default()),
+            &Board::A4,
             &CheckLimits::default(),
         )
-        .unwrap();
+        .unwrap()
+    }
+
+    fn faults(believed: &[Camera], frames: &[Vec<Frame>]) -> Vec<String> {
+        let measures = measures(believed, frames);
         for measure in &measures {
             println!(
                 "{} {}: {:.3} {}",
@@ -366,14 +457,21 @@ mod tests {
             .collect()
     }
 
+    /// Faults of cameras and pairs of them: where one is off, noise of the whole may be red too.
+    fn of_cameras(mut faults: Vec<String>) -> Vec<String> {
+        faults.retain(|fault| !fault.ends_with("all cameras"));
+        faults
+    }
+
     #[test]
     fn a_cell_in_order_is_green_and_a_moved_camera_red() {
         let cameras = Camera::ravens();
-        assert_eq!(faults(&cameras, &cameras), Vec::<String>::new());
-        // By 8 mm upwards.
+        let frames = frames(&cameras, Some(&realsense(&cameras, 4)), 10, false);
+        assert_eq!(faults(&cameras, &frames), Vec::<String>::new());
+        // Believed 8 mm too low.
         let mut moved = cameras.clone();
-        moved[1].world_from_camera.translation.z += 0.008;
-        let found = faults(&cameras, &moved);
+        moved[1].world_from_camera.translation.z -= 0.008;
+        let found = faults(&moved, &frames);
         assert!(
             found.contains(&"height left".to_owned())
                 && found.contains(&"offset front and left".to_owned()),
@@ -384,12 +482,83 @@ mod tests {
         let mut turned = cameras.clone();
         let turn = UnitQuaternion::from_axis_angle(&Vector3::x_axis(), 1f64.to_radians());
         let pose = &mut turned[2].world_from_camera;
-        *pose = Isometry3::from_parts(
-            Translation3::from(pose.translation.vector),
-            turn * pose.rotation,
-        );
-        let found = faults(&cameras, &turned);
+        pose.rotation = turn * pose.rotation;
+        let found = faults(&turned, &frames);
         assert!(found.contains(&"tilt right".to_owned()), "{found:?}");
+    }
+
+    /// A camera that stands and looks elsewhere, in a direction drawn.
+    fn off(camera: &Camera, shift_m: f64, turn_rad: f64, rng: &mut ChaCha8Rng) -> Camera {
+        let mut direction = |size: f64| {
+            let mut part = || rng.random_range(-1.0..1.0f64);
+            Vector3::new(part(), part(), part()).normalize() * size
+        };
+        let shift = direction(shift_m);
+        let turn = UnitQuaternion::from_scaled_axis(direction(turn_rad));
+        let pose = camera.world_from_camera;
+        Camera {
+            world_from_camera: Isometry3::from_parts(
+                Translation3::from(pose.translation.vector + shift),
+                turn * pose.rotation,
+            ),
+            ..camera.clone()
+        }
+    }
+
+    /// With a board on the table, at the noise of three RealSense D435: any direction, any camera.
+    #[test]
+    fn a_calibration_wrong_by_5_mm_and_half_a_degree_is_red_and_a_right_one_green() {
+        let cameras = Camera::ravens();
+        let mut rng = ChaCha8Rng::seed_from_u64(17);
+        for seed in 0..4 {
+            let frames = frames(&cameras, Some(&realsense(&cameras, seed)), 10, true);
+            assert_eq!(faults(&cameras, &frames), Vec::<String>::new(), "{seed}");
+            // What sctn calibrate leaves at that noise.
+            let right = cameras
+                .each_ref()
+                .map(|camera| off(camera, 0.5e-3, 0.05f64.to_radians(), &mut rng));
+            assert_eq!(faults(&right, &frames), Vec::<String>::new(), "{seed}");
+            for index in 0..cameras.len() {
+                for _ in 0..3 {
+                    let mut wrong = cameras.clone();
+                    wrong[index] = off(&cameras[index], 5e-3, 0.5f64.to_radians(), &mut rng);
+                    let found = of_cameras(faults(&wrong, &frames));
+                    let name = &cameras[index].name;
+                    assert!(!found.is_empty(), "{seed} {name}");
+                    // Nobody else is blamed.
+                    let is_named = |fault: &String| fault.contains(name.as_str());
+                    assert!(found.iter().all(is_named), "{seed} {name}: {found:?}");
+                }
+            }
+        }
+    }
+
+    #[test]
+    fn a_camera_that_stands_aside_is_found_by_the_board_alone() {
+        let cameras = Camera::ravens();
+        let mut aside = cameras.clone();
+        aside[0].world_from_camera.translation.y += 0.005;
+        let noise = realsense(&cameras, 2);
+        let without = frames(&cameras, Some(&noise), 10, false);
+        assert_eq!(of_cameras(faults(&aside, &without)), Vec::<String>::new());
+        let with = frames(&cameras, Some(&noise), 10, true);
+        let found = of_cameras(faults(&aside, &with));
+        assert_eq!(found, ["board front and left", "board front and right"]);
+    }
+
+    #[test]
+    fn a_cell_without_median_is_measured_from_single_sets_of_images() {
+        let cameras = Camera::ravens();
+        let frames = frames(&cameras, None, 2, false);
+        let measures = check_cameras(
+            &cameras,
+            &frames,
+            &Workspace::RAVENS,
+            None,
+            &Board::A4,
+            &CheckLimits::default(),
+        );
+        assert!(measures.unwrap().iter().all(Measure::is_good));
     }
 
     #[test]
@@ -400,7 +569,8 @@ mod tests {
             &cameras,
             &none,
             &Workspace::RAVENS,
-            &StillSettings::default(),
+            None,
+            &Board::A4,
             &CheckLimits::default(),
         );
         assert!(refusal.unwrap_err().to_string().contains("camera front"));
@@ -408,15 +578,7 @@ mod tests {
             rgb: vec![0; 3 * 640 * 480],
             depth_m: vec![0.0; 640 * 480],
         };
-        let blind = vec![vec![blind; 10]; 3];
-        let measures = check_cameras(
-            &cameras,
-            &blind,
-            &Workspace::RAVENS,
-            &StillSettings::default(),
-            &CheckLimits::default(),
-        )
-        .unwrap();
+        let measures = measures(&cameras, &vec![vec![blind; 10]; 3]);
         let bad: Vec<_> = measures
             .iter()
             .filter(|measure| !measure.is_good())

@@ -14,6 +14,15 @@ pub struct GrayImage<'a> {
     pub pixels: &'a [u8],
 }
 
+/// Grey values of an image of red, green and blue.
+pub fn gray_pixels(rgb: &[u8]) -> Vec<u8> {
+    let gray = |rgb: &[u8; 3]| {
+        let [red, green, blue] = rgb.map(u32::from);
+        ((red * 77 + green * 150 + blue * 29) >> 8) as u8
+    };
+    rgb.as_chunks::<3>().0.iter().map(gray).collect()
+}
+
 /// A tag in an image.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Tag {

@@ -15,7 +15,7 @@ pub enum CalibrationFileError {
     File {
         /// The file.
         path: String,
-        /// Why.
+        /// The reason.
         source: io::Error,
     },
     /// It holds something else.
@@ -45,7 +45,7 @@ struct PoseEntry {
 /// `cameras: {front: {translation_m: [x, y, z], rotation_xyzw: [x, y, z, w]}}`.
 ///
 /// # Errors
-/// When the file cannot be read, or is none of that kind.
+/// The file cannot be read, or does not have this form.
 pub fn read_calibration(
     path: &Path,
 ) -> Result<BTreeMap<String, Isometry3<f64>>, CalibrationFileError> {

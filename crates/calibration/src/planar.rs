@@ -23,12 +23,7 @@ pub(crate) fn project(intrinsics: &Intrinsics, point: &Point3<f64>) -> Option<Po
     if point.z <= 1e-6 {
         return None;
     }
-    let ideal = point.xy().coords / point.z;
-    let seen = intrinsics.distortion.distort(&ideal)?;
-    Some(Point2::new(
-        intrinsics.fx_px * seen.x + intrinsics.cx_px,
-        intrinsics.fy_px * seen.y + intrinsics.cy_px,
-    ))
+    intrinsics.image(point)
 }
 
 /// A pose moved a little: by the first three numbers (m), and turned about its own origin by the last three (rad), both along the axes of the frame

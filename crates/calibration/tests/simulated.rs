@@ -1,7 +1,8 @@
 //! Calibration of the cameras of Ravens from rendered images with the noise of real cameras.
 
 use calibration::{
-    Board, CameraViews, GrayImage, View, board_pose, check_swapped, detect, solve, table,
+    Board, CameraViews, GrayImage, View, board_pose, check_swapped, detect, gray_pixels, solve,
+    table,
 };
 use camera_noise::{Perturbation, Rig};
 use heightmap::{Camera, Distortion};
@@ -24,11 +25,7 @@ fn realsense() -> Perturbation {
 fn cameras() -> [Camera; 3] {
     let mut cameras = Camera::ravens();
     for (camera, k1) in cameras.iter_mut().zip([0.05, -0.04, 0.0]) {
-        camera.intrinsics.distortion = Distortion {
-            k1,
-            p1: 0.0005,
-            ..Distortion::NONE
-        };
+        camera.intrinsics.distortion = Distortion::plumb_bob([k1, 0.0, 0.0005, 0.0, 0.0]);
     }
     cameras
 }
@@ -49,11 +46,7 @@ fn image(
     BOARD.draw(camera, world_from_board, (190.0, 35.0), &mut rgb);
     let mut depth_m = vec![1.0; width * height];
     noise.apply(index, &camera.intrinsics, frame, &mut rgb, &mut depth_m);
-    rgb.chunks_exact(3)
-        .map(|rgb| {
-            ((u32::from(rgb[0]) * 77 + u32::from(rgb[1]) * 150 + u32::from(rgb[2]) * 29) >> 8) as u8
-        })
-        .collect()
+    gray_pixels(&rgb)
 }
 
 /// The board over the table, facing up, tilted and turned.

@@ -125,7 +125,7 @@ pub enum PerturbationError {
     File {
         /// The file.
         path: String,
-        /// Why.
+        /// The reason.
         source: std::io::Error,
     },
     /// It is not the YAML of a perturbation.
@@ -133,7 +133,7 @@ pub enum PerturbationError {
     Content {
         /// The file.
         path: String,
-        /// Where.
+        /// The field.
         field: String,
         /// What was found and expected.
         reason: String,

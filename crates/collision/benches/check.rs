@@ -1,9 +1,10 @@
 //! How long the check of a motion takes.
 
-use collision::{CollisionChecker, Contact, Margins, Scene, Terrain};
+use collision::{CollisionChecker, Contact, Margins, Scene, Situation, Terrain, rehearse};
 use criterion::{Criterion, criterion_group, criterion_main};
 use heightmap::{Heightmap, Workspace};
 use nalgebra::{Isometry2, Point2, Vector2};
+use pick_place::{PickPlace, PrimitiveSettings};
 use ur5::{Arm, JointTrajectory, WorkCell};
 
 fn check(criterion: &mut Criterion) {
@@ -47,6 +48,21 @@ fn check(criterion: &mut Criterion) {
             bencher.iter(|| checker.check(trajectory, &scene).expect("free"))
         });
     }
+    let pose = |x, y| Isometry2::new(Vector2::new(x, y), 0.4);
+    let action = PickPlace {
+        pick: pose(0.45, -0.2),
+        place: pose(0.55, 0.3),
+    };
+    let situation = Situation {
+        joints: &arm.home,
+        holds: false,
+        heightmap: Some(&heightmap),
+        touchdown: None,
+    };
+    let settings = PrimitiveSettings::RIGID;
+    criterion.bench_function("whole pick and place with every way home", |bencher| {
+        bencher.iter(|| rehearse(&checker, arm, &action, &settings, &situation).expect("free"))
+    });
     criterion.bench_function("terrain of a heightmap", |bencher| {
         bencher.iter(|| Terrain::new(&heightmap))
     });

@@ -9,5 +9,5 @@ pub use checker::{
     Carried, Clearance, Collision, CollisionChecker, Contact, Margins, MarginsError, Scene,
 };
 pub use lift_out::lift_out;
-pub use rehearsal::{rehearse, rehearse_home};
+pub use rehearsal::{RehearsalError, Situation, rehearse, rehearse_home, rehearse_put_down};
 pub use terrain::Terrain;

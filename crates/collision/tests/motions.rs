@@ -1,11 +1,12 @@
 //! What the check finds, and what it lets pass.
 
 use collision::{
-    Carried, Clearance, CollisionChecker, Contact, Margins, Scene, Terrain, lift_out, rehearse,
+    Carried, Clearance, CollisionChecker, Contact, Margins, Scene, Situation, Terrain, lift_out,
+    rehearse,
 };
 use heightmap::{Heightmap, Workspace};
 use nalgebra::{Isometry2, Isometry3, Point2, Point3, Vector2, Vector3};
-use pick_place::{PickPlace, PrimitiveSettings, Robot};
+use pick_place::{Outcome, PickPlace, PrimitiveSettings, Robot, Touchdown};
 use proptest::prelude::*;
 use std::convert::Infallible;
 use ur5::{Arm, JointTrajectory, Joints, Shape, WorkCell};
@@ -544,27 +545,152 @@ fn what_stands_beside_an_object_is_passed_on_its_way_straight_up_and_not_after_i
     let checker = checker(&cell);
     // Lifted by 60 mm, at 0.15 m/s.
     let settings = PrimitiveSettings::BEADS;
-    let rehearsed = |gap_m: f64, wall_m: f32| {
+    let slow = Touchdown {
+        pick_m: 0.1,
+        pick_ground_m: 0.0,
+        place_m: 0.0,
+        slow_from_m: 0.03,
+        slow_m_s: 0.05,
+        window_m: 0.015,
+        press_m: 0.003,
+        senses_pick: true,
+        senses_place: true,
+    };
+    let rehearsed = |gap_m: f64, wall_m: f32, touchdown| {
         let (heightmap, action) = block_beside_a_wall(gap_m, wall_m);
         let (arm, home) = (&cell.arm, &cell.arm.home);
-        rehearse(
-            &checker,
-            arm,
-            &action,
-            &settings,
-            home,
-            false,
-            Some(&heightmap),
-        )
+        let situation = Situation {
+            joints: home,
+            holds: false,
+            heightmap: Some(&heightmap),
+            touchdown,
+        };
+        rehearse(&checker, arm, &action, &settings, &situation)
     };
-    for gap_m in [0.005, 0.02] {
+    for (gap_m, touchdown) in [
+        (0.005, None),
+        (0.005, Some(&slow)),
+        (0.02, None),
+        (0.02, Some(&slow)),
+    ] {
         // The block hangs over a wall that is as low as that.
-        rehearsed(gap_m, 0.05).unwrap();
+        rehearsed(gap_m, 0.05, touchdown).unwrap();
         // A wall of 90 mm is higher than the block was lifted, and lower than the cup.
-        let refused = rehearsed(gap_m, 0.09).unwrap_err().to_string();
+        let refused = rehearsed(gap_m, 0.09, touchdown).unwrap_err().to_string();
         assert!(
             refused.contains("Transfer") && refused.contains("the carried object"),
             "{gap_m}: {refused}"
         );
+    }
+}
+
+#[test]
+fn a_low_way_over_a_cable_is_refused_also_where_nothing_is_seen_that_would_be_carried() {
+    let cell = cell();
+    let checker = checker(&cell);
+    // A cable of 12 mm across the way, between its ends.
+    let mut cable = empty_table();
+    for row in 158..162 {
+        cable.height_m[row * 160 + 40..row * 160 + 120].fill(0.012);
+    }
+    let pose = |y_m| Isometry2::new(Vector2::new(0.5, y_m), 0.0);
+    let action = PickPlace {
+        pick: pose(-0.2),
+        place: pose(0.2),
+    };
+    let rehearsed = |heightmap: &Heightmap, lift_m: f64| {
+        let settings = PrimitiveSettings {
+            lift_m,
+            ..PrimitiveSettings::BEADS
+        };
+        let situation = Situation {
+            joints: &cell.arm.home,
+            holds: false,
+            heightmap: Some(heightmap),
+            touchdown: None,
+        };
+        rehearse(&checker, &cell.arm, &action, &settings, &situation)
+    };
+    // The cup alone would graze it, with whatever flat thing it may hold.
+    let refused = rehearsed(&cable, 0.012).unwrap_err().to_string();
+    assert!(
+        refused.contains("Transfer") && refused.contains("the heightmap"),
+        "{refused}"
+    );
+    rehearsed(&cable, 0.05).unwrap();
+    rehearsed(&empty_table(), 0.012).unwrap();
+}
+
+/// The built-in cell with a ball of 20 mm that hangs in the air.
+fn cell_with_ball(at: Vector3<f64>) -> WorkCell {
+    let ball = format!(
+        "<link name=\"ball\"><collision><geometry><sphere radius=\"0.02\"/></geometry></collision></link>\
+        <joint name=\"world-ball\" type=\"fixed\"><parent link=\"world\"/><child link=\"ball\"/>\
+        <origin xyz=\"{} {} {}\" rpy=\"0 0 0\"/></joint></robot>",
+        at.x, at.y, at.z
+    );
+    WorkCell::parse(&cell().urdf.replace("</robot>", &ball), "cell.urdf").unwrap()
+}
+
+#[test]
+fn what_only_a_way_home_after_a_failure_would_hit_is_refused_and_named() {
+    let arm = &cell().arm;
+    let pose = |y_m| Isometry2::new(Vector2::new(0.5, y_m), 0.0);
+    let over = |y_m, height_m| {
+        let above = Arm::tip_down(&pose(y_m), height_m);
+        arm.solve(&above, &arm.ready).unwrap()
+    };
+    // Lifted much higher than the clearance: a failure is noticed where nothing else leads home from.
+    let (low_m, high_m) = (0.05, 0.45);
+    let settings = PrimitiveSettings {
+        clearance_m: low_m,
+        lift_m: high_m,
+        ..PrimitiveSettings::RIGID
+    };
+    let (right_m, left_m) = (-0.25, 0.25);
+    let home_from = |from: Joints, share: f64| from + (arm.home - from) * share;
+    let tip = |joints| arm.tip(&joints).translation.vector;
+    let wrist = |joints| arm.links(&joints)[3].translation.vector;
+    // How it ends, where it begins, picks and places, and where a ball hangs on the way home from there.
+    let cases = [
+        (
+            Outcome::NoContact,
+            (over(left_m, high_m), right_m, left_m),
+            tip(home_from(over(right_m, low_m), 0.4)),
+            "if there is nothing to pick: Home",
+        ),
+        (
+            Outcome::GraspFailed,
+            (arm.home, left_m, right_m),
+            wrist(home_from(over(left_m, high_m), 0.3)),
+            "if suction holds nothing: Home",
+        ),
+        (
+            Outcome::Dropped,
+            (arm.home, right_m, left_m),
+            wrist(home_from(over(left_m, high_m), 0.4)),
+            "if the object is lost on its way: Home",
+        ),
+    ];
+    for (ends, (start, pick_m, place_m), ball_at, reason) in cases {
+        let action = PickPlace {
+            pick: pose(pick_m),
+            place: pose(place_m),
+        };
+        let rehearsed = |cell: &WorkCell| {
+            let situation = Situation {
+                joints: &start,
+                holds: false,
+                heightmap: Some(&empty_table()),
+                touchdown: None,
+            };
+            rehearse(&checker(cell), arm, &action, &settings, &situation)
+        };
+        rehearsed(&cell()).unwrap();
+        let refused = rehearsed(&cell_with_ball(ball_at)).unwrap_err();
+        let text = refused.to_string();
+        // What is expected is looked at first: it is free.
+        assert_eq!(refused.ends, ends, "{text}");
+        assert!(text.starts_with(reason) && text.contains("ball"), "{text}");
     }
 }

@@ -22,7 +22,7 @@ pub enum SwitchError {
     Refused {
         /// The controller.
         name: String,
-        /// Why.
+        /// The reason.
         reason: String,
     },
 }
@@ -34,8 +34,10 @@ pub struct Controllers {
     software_major: u32,
 }
 
-/// Detects contact; UR has it for software of major version 5 and later.
+/// Detects contact.
 const TOOL_CONTACT: &str = "tool_contact_controller";
+/// First major version of the robot's software that has it: e-Series.
+pub const CONTACT_SINCE: u32 = 5;
 
 impl Controllers {
     /// The controllers of the UR driver; `follow` is the one that follows trajectories. All are active but those named in `inactive`,
@@ -43,7 +45,7 @@ impl Controllers {
     pub fn new(follow: &str, inactive: &[String], software_major: u32) -> Self {
         let controller = |(name, class): (&str, &'static str)| Controller {
             is_active: !inactive.iter().any(|other| other == name)
-                && (name != TOOL_CONTACT || software_major >= 5),
+                && (name != TOOL_CONTACT || software_major >= CONTACT_SINCE),
             name: name.to_owned(),
             class,
         };
@@ -88,11 +90,11 @@ impl Controllers {
                 return Err(SwitchError::Unknown(name.clone()));
             }
         }
-        if activate.iter().any(|name| name == TOOL_CONTACT) && self.software_major < 5 {
+        if activate.iter().any(|name| name == TOOL_CONTACT) && self.software_major < CONTACT_SINCE {
             return Err(SwitchError::Refused {
                 name: TOOL_CONTACT.to_owned(),
                 reason: format!(
-                    "it needs robot software 5 or later, the robot has {}",
+                    "it needs robot software {CONTACT_SINCE} or later, the robot has {}",
                     self.software_major
                 ),
             });

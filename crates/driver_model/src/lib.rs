@@ -10,9 +10,9 @@ mod settings;
 mod vacuum;
 
 pub use acceptance::{AcceptanceQueue, Answer};
-pub use controllers::{Controller, Controllers, SwitchError};
+pub use controllers::{CONTACT_SINCE, Controller, Controllers, SwitchError};
 pub use noise::EncoderNoise;
 pub use safety::{Fault, Modes};
 pub use servo::{PathDeviation, Servo};
 pub use settings::HardwareSettings;
-pub use vacuum::Vacuum;
+pub use vacuum::{Vacuum, Valves};

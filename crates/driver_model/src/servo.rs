@@ -25,8 +25,10 @@ pub struct Servo {
     scaling: f64,
 }
 
-/// Time between the points of a braking motion.
+/// Time between the points of a braking motion, and of one whose speed changes.
 const BRAKING_STEP: Duration = Duration::from_millis(10);
+/// How long the arm takes to another speed when the slider is moved.
+const SLIDING_STEPS: u32 = 15;
 
 impl Servo {
     /// `delay_s` behind (s), at `scaling` of the speed (0.01 to 1).
@@ -100,6 +102,51 @@ impl Servo {
         Ok(())
     }
 
+    /// What is left of a motion after a time, at another speed: `factor` times the present one, which is reached evenly within 0.15 s.
+    ///
+    /// # Errors
+    /// Where it would be too long.
+    pub fn slide(
+        of: &JointTrajectory,
+        elapsed: Duration,
+        factor: f64,
+    ) -> Result<JointTrajectory, PlanError> {
+        let sliding_s = f64::from(SLIDING_STEPS) * BRAKING_STEP.as_secs_f64();
+        let at = |way_s: f64, time: Duration, speed: f64| {
+            let state = of.state(elapsed + Duration::from_secs_f64(way_s));
+            TrajectoryPoint {
+                time,
+                positions_rad: state.positions_rad,
+                velocities_rad_s: state.velocities_rad_s * speed,
+            }
+        };
+        // Of the motion's own time, so much passes while the speed changes.
+        let way_s = |share: f64| sliding_s * (share + 0.5 * (factor - 1.0) * share * share);
+        let sliding = (0..=SLIDING_STEPS).map(|step| {
+            let share = f64::from(step) / f64::from(SLIDING_STEPS);
+            let speed = 1.0 + (factor - 1.0) * share;
+            at(way_s(share), BRAKING_STEP * step, speed)
+        });
+        let slid = elapsed + Duration::from_secs_f64(way_s(1.0));
+        let rest = of.points().iter().filter(|point| point.time > slid);
+        let rest = rest.map(|point| {
+            let way_s = (point.time - slid).as_secs_f64();
+            TrajectoryPoint {
+                time: Duration::from_secs_f64(sliding_s + way_s / factor),
+                positions_rad: point.positions_rad,
+                velocities_rad_s: point.velocities_rad_s * factor,
+            }
+        });
+        // Points that fall together are one.
+        let mut points: Vec<TrajectoryPoint> = sliding.collect();
+        for point in rest {
+            if points.last().is_none_or(|last| point.time > last.time) {
+                points.push(point);
+            }
+        }
+        JointTrajectory::new(points)
+    }
+
     /// The motion that stops the joints on the way of `actual`, from a time on: their speed falls evenly to zero.
     ///
     /// # Errors
@@ -133,6 +180,24 @@ mod tests {
 
     fn ms(ms: u64) -> Duration {
         Duration::from_millis(ms)
+    }
+
+    #[test]
+    fn a_motion_whose_speed_changes_goes_the_same_way_and_takes_its_new_time() {
+        let slower = Servo::slide(&turn(), ms(600), 0.5).unwrap();
+        // From where it is, at the speed that it has, to the same end.
+        let start = slower.state(ms(0));
+        assert!((start.positions_rad[0] - turn().sample(ms(600))[0]).abs() < 1e-9);
+        let speed = |time| (slower.sample(ms(time + 5))[0] - slower.sample(ms(time))[0]) / 0.005;
+        assert!((speed(0) - 1.0).abs() < 0.05, "{}", speed(0));
+        assert!((speed(200) - 0.5).abs() < 1e-6, "{}", speed(200));
+        assert!((slower.last().positions_rad[0] - 1.0).abs() < 1e-9);
+        // 0.6 s are left of it: 0.1125 s pass in 0.15 s, the rest at half the speed.
+        let expected_s = 0.15 + (0.6 - 0.1125) / 0.5;
+        assert!((slower.duration().as_secs_f64() - expected_s).abs() < 1e-6);
+        // At its very end nothing is left.
+        let end = Servo::slide(&turn(), ms(1190), 0.1).unwrap();
+        assert!((end.last().positions_rad[0] - 1.0).abs() < 1e-6);
     }
 
     /// Turns the base by a rad in a second.

@@ -25,13 +25,14 @@ pub struct HardwareSettings {
     pub path_tolerance_rad: f64,
     /// Standard deviation of the positions in `joint_states` (rad).
     pub encoder_noise_rad: f64,
-    /// Share of the planned speed, as the slider on the teach pendant sets it (0.01 to 1).
+    /// Share of the planned speed, as the slider on the teach pendant sets it (0.01 to 1), also in the middle of a motion of an arm that lags
+    /// or brakes.
     pub speed_scaling: f64,
     /// How long the arm takes to stop when a goal is cancelled or the driver stops it (s of simulated time).
     pub braking_time_s: f64,
     /// Controllers that are loaded but not active.
     pub inactive_controllers: Vec<String>,
-    /// Major version of the robot's software: 3 for a CB3, 5 or more for an e-Series.
+    /// Major version of the robot's software: 3 for a CB3, 5 or more for an e-Series. A CB3 has neither tool contact nor `trajectory_until_node`.
     pub software_major: u32,
     /// Voltage at the tool connector (V): 0, 12 or 24. At 0 pins 16 and 17 switch nothing.
     pub tool_voltage: u8,
@@ -41,6 +42,12 @@ pub struct HardwareSettings {
     pub vacuum_release_s: f64,
     /// After how long what is held is lost (s); 0 for never.
     pub vacuum_leak_s: f64,
+    /// Digital output that blows off what hangs at the cup once suction is off; -1 for none.
+    pub blow_off_pin: i8,
+    /// Digital input of an enabling switch; -1 for none.
+    pub enable_pin: i8,
+    /// Whether the enabling switch is held.
+    pub enabled: bool,
     /// What is wrong with the robot now.
     pub fault: Fault,
 }
@@ -63,6 +70,9 @@ impl Default for HardwareSettings {
             vacuum_build_s: 0.0,
             vacuum_release_s: 0.0,
             vacuum_leak_s: 0.0,
+            blow_off_pin: -1,
+            enable_pin: -1,
+            enabled: true,
             fault: Fault::None,
         }
     }

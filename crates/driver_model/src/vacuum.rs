@@ -4,9 +4,18 @@ use std::time::Duration;
 
 use crate::HardwareSettings;
 
-/// The valve, the cup and the sensor of the suction tool.
+/// What the valves of the tool were told, where they have power.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Valves {
+    /// Air is sucked.
+    pub suction: bool,
+    /// Air is blown: without suction the cup lets go at once.
+    pub blow_off: bool,
+}
+
+/// The valves, the cup and the sensor of the suction tool.
 ///
-/// The caller says what the valve was told and whether the cup is closed by an object; this says what the sensor shows and
+/// The caller says what the valves were told and whether the cup is closed by an object; this says what the sensor shows and
 /// whether the object still hangs.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
 pub struct Vacuum {
@@ -18,13 +27,12 @@ pub struct Vacuum {
 }
 
 impl Vacuum {
-    /// Brings the vacuum to a time. `suction`: whether the valve is open and has power; `closed`: whether an object is at the cup.
-    /// Returns whether the object stays at the cup.
+    /// Brings the vacuum to a time. `closed`: whether an object is at the cup. Returns whether the object stays at the cup.
     pub fn update(
         &mut self,
         settings: &HardwareSettings,
         now: Duration,
-        suction: bool,
+        valves: Valves,
         closed: bool,
     ) -> bool {
         let after = |since: &mut Option<Duration>, limit_s: f64| {
@@ -35,7 +43,7 @@ impl Vacuum {
             *self = Self::default();
             return false;
         }
-        if suction {
+        if valves.suction {
             self.off_since = None;
             self.senses = after(&mut self.closed_since, settings.vacuum_build_s);
             let leak_s = settings.vacuum_leak_s;
@@ -46,7 +54,7 @@ impl Vacuum {
             return !lost;
         }
         self.closed_since = None;
-        let released = after(&mut self.off_since, settings.vacuum_release_s);
+        let released = after(&mut self.off_since, settings.vacuum_release_s) || valves.blow_off;
         if released {
             *self = Self::default();
         }
@@ -67,13 +75,42 @@ mod tests {
         Duration::from_millis(ms)
     }
 
+    const SUCKS: Valves = Valves {
+        suction: true,
+        blow_off: false,
+    };
+    const BLOWS: Valves = Valves {
+        suction: false,
+        blow_off: true,
+    };
+    const OFF: Valves = Valves {
+        suction: false,
+        blow_off: false,
+    };
+
     #[test]
     fn an_ideal_vacuum_is_there_and_gone_at_once() {
         let settings = HardwareSettings::default();
         let mut vacuum = Vacuum::default();
-        assert!(vacuum.update(&settings, ms(0), true, true) && vacuum.senses());
-        assert!(!vacuum.update(&settings, ms(0), false, true) && !vacuum.senses());
-        assert!(!vacuum.update(&settings, ms(0), true, false) && !vacuum.senses());
+        assert!(vacuum.update(&settings, ms(0), SUCKS, true) && vacuum.senses());
+        assert!(!vacuum.update(&settings, ms(0), OFF, true) && !vacuum.senses());
+        assert!(!vacuum.update(&settings, ms(0), SUCKS, false) && !vacuum.senses());
+    }
+
+    #[test]
+    fn what_sticks_is_blown_off_once_suction_is_off() {
+        let settings = HardwareSettings {
+            vacuum_release_s: 60.0,
+            ..HardwareSettings::default()
+        };
+        let mut vacuum = Vacuum::default();
+        let both = Valves {
+            suction: true,
+            blow_off: true,
+        };
+        assert!(vacuum.update(&settings, ms(0), both, true) && vacuum.senses());
+        assert!(vacuum.update(&settings, ms(10_000), OFF, true) && vacuum.senses());
+        assert!(!vacuum.update(&settings, ms(10_000), BLOWS, true) && !vacuum.senses());
     }
 
     #[test]
@@ -86,7 +123,8 @@ mod tests {
         };
         let mut vacuum = Vacuum::default();
         let mut at = |time, suction, closed| {
-            let stays = vacuum.update(&settings, ms(time), suction, closed);
+            let valves = if suction { SUCKS } else { OFF };
+            let stays = vacuum.update(&settings, ms(time), valves, closed);
             (stays, vacuum.senses())
         };
         assert_eq!(at(0, true, false), (false, false));

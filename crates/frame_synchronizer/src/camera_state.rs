@@ -3,13 +3,10 @@
 use std::collections::VecDeque;
 use std::time::Duration;
 
-use heightmap::{Camera, Intrinsics, Transforms, has_shape_of, register_depth, scale_depth};
+use heightmap::{Camera, Transforms};
 use nalgebra::Isometry3;
 
-use super::{Image, InputError, Stream, Used};
-
-/// A calibration as it arrived, or what is wrong with it; none before the first.
-type Calibration = Option<Result<Intrinsics, String>>;
+use super::{Calibration, ColorImage, DepthReader, Image, InputError, Stream, Used};
 
 /// What has arrived of one camera.
 pub(super) struct CameraState<I> {
@@ -25,8 +22,7 @@ pub(super) struct CameraState<I> {
     pub(super) rgb: Vec<u8>,
     /// For the pixels of the colour image.
     pub(super) depth_m: Vec<f32>,
-    /// As it was measured.
-    measured_m: Vec<f32>,
+    depth_reader: DepthReader,
     /// Nothing has come for a while.
     pub(super) silent: bool,
 }
@@ -43,7 +39,7 @@ impl<I: Image> CameraState<I> {
             depth: VecDeque::new(),
             rgb: Vec::new(),
             depth_m: Vec::new(),
-            measured_m: Vec::new(),
+            depth_reader: DepthReader::default(),
             silent: false,
         }
     }
@@ -109,7 +105,19 @@ impl<I: Image> CameraState<I> {
             bad.push(invalid(Stream::Color, error.to_string()));
             self.color.remove(color);
         }
-        match self.register(index, depth, &color_frame, &camera, transforms) {
+        let color_image = ColorImage {
+            index,
+            camera: &camera,
+            frame: &color_frame,
+        };
+        let read = self.depth_reader.read(
+            &self.depth[depth].1,
+            &self.depth_intrinsics,
+            &color_image,
+            transforms,
+            &mut self.depth_m,
+        );
+        match read {
             Ok(()) => {}
             // It can be used when what is missing comes.
             Err(missing) if missing.pending => bad.push(missing),
@@ -123,79 +131,5 @@ impl<I: Image> CameraState<I> {
         } else {
             Err(bad)
         }
-    }
-
-    /// Fills `depth_m` from a depth image: as it is where it is of the colour image's frame and size, scaled where only the size differs,
-    /// registered where the frame differs, by way of the transform between both frames and the depth image's own calibration.
-    fn register(
-        &mut self,
-        index: usize,
-        depth: usize,
-        color_frame: &str,
-        camera: &Camera,
-        transforms: &Transforms,
-    ) -> Result<(), InputError> {
-        let refuse = |stream, reason: String| InputError::new(index, stream, reason);
-        let image = &self.depth[depth].1;
-        let size_px = image.size_px();
-        let depth_frame = image.frame();
-        let expected = &camera.intrinsics;
-        let read = image.read_depth(&mut self.measured_m);
-        read.map_err(|error| refuse(Stream::Depth, error.to_string()))?;
-        if Transforms::is_same(depth_frame, color_frame) {
-            if size_px == (expected.width, expected.height) {
-                std::mem::swap(&mut self.depth_m, &mut self.measured_m);
-            } else if has_shape_of(expected, size_px.0, size_px.1) {
-                scale_depth(&self.measured_m, size_px, expected, &mut self.depth_m);
-            } else {
-                return Err(refuse(
-                    Stream::Depth,
-                    format!(
-                        "width and height are {} and {}, expected those of the colour image, {} and {}, or the same shape in another \
-                         size",
-                        size_px.0, size_px.1, expected.width, expected.height
-                    ),
-                ));
-            }
-            return Ok(());
-        }
-        let differ = format!(
-            "header.frame_id is {depth_frame:?}, expected that of the colour image, {color_frame:?}, since depth must be registered to it"
-        );
-        let Some(color_from_depth) = transforms.between(color_frame, depth_frame) else {
-            let reason = format!("{differ}, or transforms between the two frames");
-            return Err(InputError::pending(index, Stream::Depth, reason));
-        };
-        let intrinsics = match &self.depth_intrinsics {
-            Some(Ok(intrinsics)) => *intrinsics,
-            Some(Err(reason)) => {
-                let reason =
-                    format!("{differ}, or a valid calibration of the depth image: {reason}");
-                return Err(refuse(Stream::DepthInfo, reason));
-            }
-            None => {
-                let reason =
-                    format!("{differ}, or a calibration of the depth image, none has arrived");
-                return Err(InputError::pending(index, Stream::DepthInfo, reason));
-            }
-        };
-        let depth_camera = Camera {
-            name: format!("{} depth", camera.name),
-            intrinsics,
-            world_from_camera: camera.world_from_camera * color_from_depth,
-        };
-        let checked = depth_camera.check();
-        checked.map_err(|error| refuse(Stream::DepthInfo, error.to_string()))?;
-        if size_px != (intrinsics.width, intrinsics.height) {
-            return Err(refuse(
-                Stream::Depth,
-                format!(
-                    "width and height are {} and {}, expected those of its calibration, {} and {}",
-                    size_px.0, size_px.1, intrinsics.width, intrinsics.height
-                ),
-            ));
-        }
-        register_depth(&self.measured_m, &depth_camera, camera, &mut self.depth_m);
-        Ok(())
     }
 }

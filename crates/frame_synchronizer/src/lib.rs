@@ -2,6 +2,7 @@
 //! whatever a driver sends, and is decoded only when it is fused.
 
 mod camera_state;
+mod depth_reader;
 
 use std::collections::{BTreeMap, VecDeque};
 use std::fmt::Display;
@@ -15,10 +16,14 @@ use nalgebra::Isometry3;
 
 use self::camera_state::CameraState;
 
+pub use self::depth_reader::{Calibration, ColorImage, DepthReader};
+
 /// Images of one stream that wait for their counterparts.
 const WAITING_IMAGES: usize = 4;
 /// A stamp this much older than the last heightmap's means that the clock was set back.
 const CLOCK_SET_BACK: Duration = Duration::from_secs(1);
+/// After so long without a set of images the scene may be another one, also where what has moved is lower than a motion that is noticed.
+const UNSEEN: Duration = Duration::from_secs(2);
 
 /// An image as a driver sends it: colour or depth.
 pub trait Image {
@@ -113,7 +118,7 @@ impl InputError {
 /// within `tolerance_s` of one reference stamp. The reference is the newest colour stamp for which that
 /// holds; of several images of a stream the nearest is taken. A set is fused once: it must be newer than
 /// the last one. One that cannot be used, such as of a frame without a transform, holds up no older one.
-/// A silent camera is waited for, unless `fuse_without_silent`.
+/// A silent camera is waited for, unless `fuse_without_silent`. A median is of sets between which the scene was seen all the time.
 pub struct FrameSynchronizer<I> {
     cameras: Vec<CameraState<I>>,
     transforms: Transforms,
@@ -145,7 +150,7 @@ pub struct Fused {
     pub report: FusionReport,
     /// Of the newest image.
     pub stamp: Duration,
-    /// By camera; nothing where it was left out.
+    /// By camera; `None` where it was left out.
     pub used: Vec<Option<Used>>,
 }
 
@@ -302,6 +307,10 @@ impl<I: Image> FrameSynchronizer<I> {
             })
             .collect();
         let general = |reason: String| vec![InputError::new(0, Stream::Color, reason)];
+        let unseen = self.last.is_some_and(|last| stamp > last + UNSEEN);
+        if let Some(still) = self.still.as_mut().filter(|_| unseen) {
+            still.forget();
+        }
         self.last = Some(stamp);
         let report = match &mut self.still {
             None => self.fusion.fuse(&views, &mut self.heightmap).map(Some),

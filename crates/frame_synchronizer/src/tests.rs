@@ -384,6 +384,12 @@ fn with_several_frames_a_heightmap_is_their_median_and_waits_until_nothing_moves
     let (stamp_ms, height_m) = fuse(1166, 0.099).unwrap();
     assert_eq!(stamp_ms, 1166);
     assert!((height_m - 0.1).abs() < 1e-4, "{height_m}");
+    // A disk of 12 mm, which is lower than a motion that is noticed, was carried away while no camera took images.
+    assert_eq!(fuse(9000, 0.088), None);
+    assert_eq!(fuse(9033, 0.088), None);
+    let (stamp_ms, height_m) = fuse(9066, 0.088).unwrap();
+    assert_eq!(stamp_ms, 9066);
+    assert!((height_m - 0.088).abs() < 1e-4, "{height_m}");
 }
 
 /// Both cameras, with this depth image of the second one.

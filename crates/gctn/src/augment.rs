@@ -18,9 +18,9 @@ pub(crate) struct Warp {
     pub motion_px: Isometry2<f64>,
     /// Whether the image is mirrored, columns in reverse, before it is moved.
     pub mirrored: bool,
-    /// Applied to RGB in 0..255; none where it changes nothing.
+    /// Applied to RGB in 0..255; `None` for no change.
     pub colour: Option<Matrix3<f32>>,
-    /// What each image, in the order in which a network reads them, gets on its own; none where there is none.
+    /// Sensor noise of each image, in the order in which a network reads them; empty without noise.
     pub sensors: Vec<Sensor>,
     /// How the images are sampled.
     pub interpolation: Interpolation,

@@ -3,7 +3,7 @@
 
 use serde::{Deserialize, Serialize};
 
-use crate::{Decision, Error, ScoreMap};
+use crate::{Error, ScoreMap};
 
 /// Scores within this distance of a decision's poses count for it. A little more than 4 cells, so that no last bit says whether the
 /// cells at that distance count.
@@ -163,30 +163,6 @@ impl Calibration {
 
 fn logistic(odds: f64) -> f64 {
     (1.0 + (-odds).exp()).recip()
-}
-
-/// What to do with a decision.
-#[derive(Clone, Copy, Debug, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum Verdict {
-    /// Propose it.
-    Act,
-    /// The step is done already: there is nothing to do.
-    Done,
-    /// It is too likely to earn nothing: ask a person.
-    Unknown,
-}
-
-impl Decision {
-    /// The verdict on this decision. `unknown_below` is the probability of success below which the answer is "I do not know"; a
-    /// checkpoint without a calibration is never asked.
-    pub fn verdict(&self, unknown_below: f64) -> Verdict {
-        match (self.done, self.success) {
-            (Some(done), _) if done > 0.5 => Verdict::Done,
-            (_, Some(success)) if success < unknown_below => Verdict::Unknown,
-            _ => Verdict::Act,
-        }
-    }
 }
 
 #[cfg(test)]

@@ -130,15 +130,15 @@ pub enum Error {
     Io {
         /// The file.
         path: PathBuf,
-        /// Why.
+        /// The reason.
         source: std::io::Error,
     },
     /// The device cannot be used.
     #[error("device {device} cannot be used: {problem}")]
     NoCuda {
-        /// Which.
+        /// The device.
         device: crate::Device,
-        /// Why.
+        /// The reason.
         problem: String,
     },
     /// libtorch refused.

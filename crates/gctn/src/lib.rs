@@ -22,7 +22,7 @@ mod sample;
 mod trainer;
 
 pub use batch::{Batch, BatchMaker};
-pub use calibration::{Calibration, Evidence, Verdict};
+pub use calibration::{Calibration, Evidence};
 pub use checkpoint::{ModelCard, Storage, average, calibrate};
 pub use config::{
     Augmentation, Compact, Device, EmbeddingConfig, EmbeddingTraining, GoalConditioning, GrConvnet,

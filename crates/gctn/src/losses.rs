@@ -93,7 +93,7 @@ pub(crate) fn place_logits(
     correlated(grid, features, &windows)
 }
 
-/// What windows say of each place, and what was said of it before the pick.
+/// Logits of each place: correlation with the windows, plus the place logits that do not depend on the pick.
 fn correlated(grid: &Grid, features: &Features, windows: &Tensor) -> Tensor {
     let logits = correlate(&features.key, &(windows * &features.scale), grid);
     match &features.first {

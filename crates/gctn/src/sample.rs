@@ -1,6 +1,5 @@
 //! Training samples.
 
-use crate::GoalConditioning;
 use heightmap::Heightmap;
 use nalgebra::Isometry2;
 
@@ -33,18 +32,6 @@ impl<'a> Goal<'a> {
             image,
             last: None,
             previous: Some(previous),
-        }
-    }
-
-    /// The same goal as a network of this conditioning takes it: without an image before the goal that it does not
-    /// look at.
-    pub fn for_conditioning(self, conditioning: GoalConditioning) -> Self {
-        match conditioning {
-            GoalConditioning::Sequence => self,
-            GoalConditioning::NextStep | GoalConditioning::Final | GoalConditioning::Both => Self {
-                previous: None,
-                ..self
-            },
         }
     }
 }

@@ -2,7 +2,7 @@
 
 use gctn::{
     Calibration, Compact, Decision, Goal, GoalConditioning, Matching, ModelCard, Network,
-    NetworkConfig, Policy, Storage, Trainer, TrainingConfig, Verdict,
+    NetworkConfig, Policy, Storage, Trainer, TrainingConfig,
 };
 use heightmap::{Disk, Heightmap, Workspace};
 use safetensors::SafeTensors;
@@ -230,14 +230,6 @@ fn a_calibrated_checkpoint_decides_the_same_and_says_how_likely_it_is() {
             ..plain.clone()
         }
     );
-    assert_eq!(with.verdict(success), Verdict::Act);
-    assert_eq!(with.verdict(success + 1e-6), Verdict::Unknown);
-    assert_eq!(plain.verdict(1.0), Verdict::Act);
-    let done = Decision {
-        done: Some(0.9),
-        ..with
-    };
-    assert_eq!(done.verdict(1.0), Verdict::Done);
 }
 
 #[test]

@@ -59,6 +59,26 @@ impl Intrinsics {
             .unwrap_or(nothing)
             .push(1.0)
     }
+
+    /// Where a point of the optical frame, which is before the camera, is shown. None where the lens does not show it.
+    pub fn image(&self, point: &Point3<f64>) -> Option<Point2<f64>> {
+        let Self {
+            fx_px,
+            fy_px,
+            cx_px,
+            cy_px,
+            distortion,
+            ..
+        } = *self;
+        if distortion.is_none() {
+            return Some(Point2::new(
+                fx_px * point.x / point.z + cx_px,
+                fy_px * point.y / point.z + cy_px,
+            ));
+        }
+        let seen = distortion.distort(&(point.xy().coords / point.z))?;
+        Some(Point2::new(fx_px * seen.x + cx_px, fy_px * seen.y + cy_px))
+    }
 }
 
 /// A calibrated camera.
@@ -86,12 +106,13 @@ pub enum CameraError {
     },
     /// The distortion leaves a part of the image without rays.
     #[error(
-        "camera {camera}: the distortion {distortion:?} cannot be undone at pixel ({u_px}, {v_px}): \
-         expected one that shows what is further out further out"
+        "camera {camera}: the distortion {model} {coefficients:?} cannot be undone at pixel ({u_px}, {v_px}): \
+         expected one that shows what is further out further out, less than 90 degrees from the axis"
     )]
     Distortion {
         camera: String,
-        distortion: Distortion,
+        model: &'static str,
+        coefficients: Vec<f64>,
         u_px: f64,
         v_px: f64,
     },
@@ -161,7 +182,8 @@ impl Camera {
                 if !(distortion.is_finite() && ray.iter().all(|part| part.is_finite())) {
                     return Err(CameraError::Distortion {
                         camera: self.name.clone(),
-                        distortion,
+                        model: distortion.model(),
+                        coefficients: distortion.coefficients(),
                         u_px,
                         v_px,
                     });
@@ -190,24 +212,7 @@ impl Camera {
         if point.z <= 0.0 {
             return None;
         }
-        let Intrinsics {
-            fx_px,
-            fy_px,
-            cx_px,
-            cy_px,
-            distortion,
-            ..
-        } = self.intrinsics;
-        let image = if distortion.is_none() {
-            Point2::new(
-                fx_px * point.x / point.z + cx_px,
-                fy_px * point.y / point.z + cy_px,
-            )
-        } else {
-            let seen = distortion.distort(&(point.xy().coords / point.z))?;
-            Point2::new(fx_px * seen.x + cx_px, fy_px * seen.y + cy_px)
-        };
-        Some((image, point.z))
+        Some((self.intrinsics.image(&point)?, point.z))
     }
 }
 
@@ -274,28 +279,112 @@ mod tests {
     }
 
     /// A consumer RGB-D camera, calibrated.
-    const LENS: Distortion = Distortion {
-        k1: 0.12,
-        k2: -0.24,
-        p1: 0.0011,
-        p2: -0.0007,
-        k3: 0.09,
-    };
+    fn lens() -> Distortion {
+        Distortion::plumb_bob([0.12, -0.24, 0.0011, -0.0007, 0.09])
+    }
+
+    /// Cameras as their makers calibrate them: width, height, fx, fy, cx, cy, lens.
+    fn real_cameras() -> Vec<(&'static str, Intrinsics)> {
+        let camera = |name, (width, height), [fx_px, fy_px, cx_px, cy_px]: [f64; 4], distortion| {
+            let intrinsics = Intrinsics {
+                width,
+                height,
+                fx_px,
+                fy_px,
+                cx_px,
+                cy_px,
+                distortion,
+            };
+            (name, intrinsics)
+        };
+        vec![
+            camera(
+                "RealSense D435, colour",
+                (1280, 720),
+                [918.3, 918.1, 642.7, 361.2],
+                Distortion::plumb_bob([0.157, -0.499, -0.0008, 0.0006, 0.459]),
+            ),
+            camera(
+                "RealSense D405",
+                (848, 480),
+                [434.2, 433.5, 421.9, 239.6],
+                Distortion::plumb_bob([-0.0547, 0.0602, 0.0005, 0.0011, -0.0194]),
+            ),
+            camera(
+                "Orbbec Femto Mega, colour",
+                (1280, 720),
+                [745.6, 745.2, 640.3, 361.9],
+                Distortion::rational([
+                    0.0746, -0.1057, -0.0003, -0.0002, 0.0434, 0.0021, -0.0033, 0.0011,
+                ]),
+            ),
+            camera(
+                "Orbbec Femto Bolt and Azure Kinect, colour: a strong denominator",
+                (1280, 720),
+                [605.9, 605.7, 638.4, 366.5],
+                Distortion::rational([
+                    0.5179, -2.5816, 0.0007, -0.0002, 1.4943, 0.3954, -2.4092, 1.4233,
+                ]),
+            ),
+            camera(
+                "Azure Kinect, depth, narrow field of view",
+                (640, 576),
+                [504.4, 504.5, 320.3, 333.0],
+                Distortion::rational([
+                    5.2613, 3.4961, 0.00001, -0.00006, 0.1788, 5.5938, 5.2337, 0.9184,
+                ]),
+            ),
+            camera(
+                "ZED 2i, left, raw",
+                (1280, 720),
+                [528.9, 528.5, 645.1, 362.4],
+                Distortion::rational([
+                    -0.0396, 0.0089, 0.0002, -0.0001, -0.0046, 0.0012, -0.0008, 0.0003,
+                ]),
+            ),
+            camera(
+                "RealSense T265, a fisheye, the middle of its image",
+                (560, 420),
+                [285.7, 286.5, 280.7, 208.4],
+                Distortion::equidistant([-0.0079, 0.0447, -0.0418, 0.0076]),
+            ),
+            camera(
+                "a fisheye of 150 degrees across",
+                (1280, 960),
+                [600.0, 600.0, 640.0, 480.0],
+                Distortion::equidistant([0.021, -0.008, 0.003, -0.0007]),
+            ),
+        ]
+    }
+
+    #[test]
+    fn a_fisheye_that_sees_90_degrees_from_its_axis_in_a_corner_is_refused_with_the_pixel() {
+        let mut camera = Camera::ravens()[0].clone();
+        // The corners are 2.6 rad from the axis.
+        camera.intrinsics.fx_px = 150.0;
+        camera.intrinsics.fy_px = 150.0;
+        camera.intrinsics.distortion = Distortion::equidistant([0.0; 4]);
+        let error = camera.check().unwrap_err().to_string();
+        assert!(
+            error.contains("camera front")
+                && error.contains("equidistant")
+                && error.contains("pixel (0, 0)"),
+            "{error}"
+        );
+    }
 
     #[test]
     fn a_distortion_that_cannot_be_undone_in_the_image_is_refused_with_a_pixel() {
         let mut camera = Camera::ravens()[0].clone();
-        camera.intrinsics.distortion = LENS;
+        camera.intrinsics.distortion = lens();
         assert_eq!(camera.check(), Ok(()));
         for distortion in [
-            Distortion {
-                k1: -0.9,
-                ..Distortion::NONE
-            },
-            Distortion {
-                p1: f64::NAN,
-                ..Distortion::NONE
-            },
+            Distortion::plumb_bob([-0.9, 0.0, 0.0, 0.0, 0.0]),
+            Distortion::plumb_bob([0.0, 0.0, f64::NAN, 0.0, 0.0]),
+            Distortion::rational([0.0, 0.0, 0.0, 0.0, 0.0, 3.0, 0.0, 0.0]),
+            Distortion::rational([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, f64::NAN, 0.0]),
+            Distortion::equidistant([-0.6, 0.0, 0.0, 0.0]),
+            Distortion::equidistant([0.0, 0.0, 0.0, f64::NAN]),
         ] {
             camera.intrinsics.distortion = distortion;
             let error = camera.check().unwrap_err().to_string();
@@ -308,11 +397,35 @@ mod tests {
 
     proptest! {
         #[test]
+        fn any_pixel_of_a_real_camera_is_where_its_ray_is_shown(
+            u in 0.0..1.0, v in 0.0..1.0, depth_m in 0.1..10.0,
+        ) {
+            for (name, intrinsics) in real_cameras() {
+                let camera = Camera {
+                    name: name.into(),
+                    intrinsics,
+                    world_from_camera: Camera::ravens()[1].world_from_camera,
+                };
+                prop_assert_eq!(camera.check(), Ok(()));
+                let (right, bottom) = ((intrinsics.width - 1) as f64, (intrinsics.height - 1) as f64);
+                // The edges too.
+                for image in [Point2::new(u * right, v * bottom), Point2::new(u * right, 0.0), Point2::new(right, v * bottom)] {
+                    let point = camera.back_project(&image, depth_m);
+                    let Some((again, again_m)) = camera.project(&point) else {
+                        return Err(TestCaseError::fail(format!("{name}: nothing at {image}")));
+                    };
+                    prop_assert!((again - image).amax() < 1e-4, "{name}: {again} {image}");
+                    prop_assert!((again_m - depth_m).abs() < 1e-9 * depth_m.max(1.0) , "{name}");
+                }
+            }
+        }
+
+        #[test]
         fn behind_a_lens_projection_undoes_back_projection_too(
             u_px in 0.0..639.0, v_px in 0.0..479.0, depth_m in 0.01..10.0, which in 0usize..3,
         ) {
             let mut camera = Camera::ravens()[which].clone();
-            camera.intrinsics.distortion = LENS;
+            camera.intrinsics.distortion = lens();
             let image = Point2::new(u_px, v_px);
             let point = camera.back_project(&image, depth_m);
             let (again, depth_again_m) = camera.project(&point).unwrap();

@@ -54,7 +54,7 @@ pub struct Change {
     pub center_m: Point2<f64>,
     /// Its area.
     pub area_m2: f64,
-    /// Greatest change of the height in it, positive upwards; none where its cells are not seen any more.
+    /// Greatest change of the height in it, positive upwards; `None` where its cells are not seen any more.
     pub height_m: Option<f64>,
     /// Whether a part of it lies near a pick or a place.
     pub near: bool,

@@ -89,7 +89,7 @@ impl LensRays {
 }
 
 /// The cell of points off the grid.
-const OUTSIDE: u32 = u32::MAX;
+pub(crate) const OUTSIDE: u32 = u32::MAX;
 
 impl Fusion {
     /// Highest point per cell wins; colour is the mean over the views that saw the cell
@@ -191,10 +191,7 @@ impl Fusion {
             (if inside { index } else { OUTSIDE }, ordered(z_m))
         };
         let lens = lens(&mut self.lenses, index, &view.camera.intrinsics);
-        let outline = match lens {
-            Some(_) => Outline { edges: None },
-            None => Outline::new(view.camera, workspace),
-        };
+        let outline = Outline::new(view.camera, workspace);
         for v in 0..height {
             // Most pixels see only what is beside the workspace.
             let columns = outline.columns(v, width);
@@ -258,10 +255,10 @@ fn lens<'a>(
     Some(&known.rays)
 }
 
-/// The outline of a workspace on an image.
-struct Outline {
+/// The outline of a workspace on an image without distortion.
+pub(crate) struct Outline {
     /// The edges of the box, each from its upper to its lower end; none if a corner is not before the
-    /// camera.
+    /// camera, or behind a lens.
     edges: Option<[(Point2<f64>, Point2<f64>); 12]>,
 }
 
@@ -269,7 +266,11 @@ impl Outline {
     /// Far more than the rounding of a point.
     const MARGIN_M: f64 = 1e-3;
 
-    fn new(camera: &Camera, workspace: &Workspace) -> Self {
+    pub(crate) fn new(camera: &Camera, workspace: &Workspace) -> Self {
+        // A lens bends the edges.
+        if !camera.intrinsics.distortion.is_none() {
+            return Self { edges: None };
+        }
         let margin = Vector3::repeat(Self::MARGIN_M);
         let size =
             workspace.pixel_size_m * Vector2::new(workspace.cols as f64, workspace.rows as f64);
@@ -298,7 +299,7 @@ impl Outline {
     }
 
     /// The pixels of an image row that can see the workspace.
-    fn columns(&self, row: usize, width: usize) -> Range<usize> {
+    pub(crate) fn columns(&self, row: usize, width: usize) -> Range<usize> {
         let Some(edges) = &self.edges else {
             return 0..width;
         };
@@ -327,19 +328,19 @@ const NO_FRACTION: f32 = (1 << 23) as f32;
 
 /// Rounds down; for numbers from 0 to 2^22. Unlike `f32::floor` and `as` it needs nothing that
 /// the oldest x86-64 lacks, so that the compiler can do several at once.
-fn floor(x: f32) -> f32 {
+pub(crate) fn floor(x: f32) -> f32 {
     let nearest = (x + NO_FRACTION) - NO_FRACTION;
     nearest - if nearest > x { 1.0 } else { 0.0 }
 }
 
 /// A whole number from 0 to 2^22 as an integer.
-fn whole(x: f32) -> u32 {
+pub(crate) fn whole(x: f32) -> u32 {
     (x + NO_FRACTION).to_bits() & 0x7f_ffff
 }
 
 /// Sums divided by a number of views, rounded. Multiplies by the reciprocal, which is exact for the
 /// sums of up to [`MAX_VIEWS`] bytes.
-fn mean(sums: [u32; 3], views: u32) -> [u8; 3] {
+pub(crate) fn mean(sums: [u32; 3], views: u32) -> [u8; 3] {
     const RECIPROCALS: [u64; MAX_VIEWS + 1] = {
         let mut reciprocals = [0; MAX_VIEWS + 1];
         let mut views = 1;
@@ -409,13 +410,14 @@ mod tests {
         distortion: Distortion::NONE,
     };
 
-    const LENS: Distortion = Distortion {
-        k1: 0.12,
-        k2: -0.24,
-        p1: 0.011,
-        p2: -0.007,
-        k3: 0.09,
-    };
+    /// One of each model.
+    fn lenses() -> [Distortion; 3] {
+        [
+            Distortion::plumb_bob([0.12, -0.24, 0.011, -0.007, 0.09]),
+            Distortion::rational([0.52, -2.58, 0.001, -0.002, 1.49, 0.40, -2.41, 1.42]),
+            Distortion::equidistant([-0.008, 0.045, -0.042, 0.008]),
+        ]
+    }
 
     /// Looks straight down from a metre above a point; the image's x runs along the world's x.
     fn above(x_m: f64, y_m: f64) -> Camera {
@@ -645,7 +647,7 @@ mod tests {
         };
         let mut used = Fusion::default();
         let mut bent = small.clone();
-        bent.intrinsics.distortion = LENS;
+        bent.intrinsics.distortion = lenses()[0];
         let through_lens = View {
             camera: &bent,
             ..view
@@ -672,11 +674,11 @@ mod tests {
         fn fusion_agrees_with_its_definition(
             depths in prop::collection::vec(0.85f32..1.05, 1200),
             x_m in 0.3..0.7, y_m in -0.4..0.4, yaw_rad in -3.0..3.0, tilt_rad in -0.5..0.5,
-            behind_a_lens: bool,
+            lens in 0usize..4,
         ) {
             let mut camera = above(x_m, y_m);
-            if behind_a_lens {
-                camera.intrinsics.distortion = LENS;
+            if let Some(lens) = lenses().get(lens) {
+                camera.intrinsics.distortion = *lens;
             }
             let turn = UnitQuaternion::from_euler_angles(tilt_rad, 0.0, yaw_rad);
             camera.world_from_camera.rotation = turn * camera.world_from_camera.rotation;

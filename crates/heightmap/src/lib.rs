@@ -16,9 +16,9 @@ mod workspace;
 
 pub use camera::{Camera, CameraError, Intrinsics};
 pub use change::{BlobRule, Change, ChangeRules, OtherWorkspace, largest_change};
-pub use distortion::Distortion;
+pub use distortion::{Distortion, LensError};
 pub use fusion::{Fusion, FusionError, FusionReport, View};
-pub use registration::{has_shape_of, register_depth, scale_depth};
+pub use registration::{DepthRegistration, has_shape_of, scale_depth};
 pub use still::{StillFusion, StillSettings};
 pub use transforms::{TransformError, Transforms, Unconnected};
 pub use workspace::{Disk, Heightmap, HeightmapError, Pixel, Workspace, WorkspaceError};

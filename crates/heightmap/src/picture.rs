@@ -24,7 +24,7 @@ const PLACE: Rgb<u8> = Rgb([60, 255, 60]);
 pub struct PictureError {
     /// The file.
     path: PathBuf,
-    /// Why.
+    /// The reason.
     source: image::ImageError,
 }
 

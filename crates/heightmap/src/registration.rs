@@ -1,7 +1,7 @@
 //! Depth images of another size or another camera, brought to the pixels of the colour image.
 
 use crate::{Camera, Intrinsics};
-use nalgebra::Point2;
+use nalgebra::{Point2, Vector3};
 
 /// A depth pixel covers at most this many pixels of the colour image along each side; more is no pair of cameras on one mast.
 const MAX_FOOTPRINT_PX: i64 = 16;
@@ -29,62 +29,106 @@ pub fn scale_depth(
     }
 }
 
-/// Registers a row-major depth image of the camera `depth` to the image of the camera `color`, both posed in one frame: what `color`
-/// would have measured, in metres along its optical axis, 0 where it sees nothing of what `depth` has measured.
+/// Registers depth images of one camera to the colour images of another. The rays of the depth image are computed once for each calibration.
 ///
-/// Each depth pixel fills the pixels of the colour image that its own area covers there, and the nearest surface wins, as
-/// librealsense's `align` does. `out_m` is overwritten.
-pub fn register_depth(depth_m: &[f32], depth: &Camera, color: &Camera, out_m: &mut Vec<f32>) {
-    let (width, height) = (
-        color.intrinsics.width as i64,
-        color.intrinsics.height as i64,
-    );
-    out_m.clear();
-    out_m.resize(color.intrinsics.len(), 0.0);
-    let color_from_depth = color.world_from_camera.inv_mul(&depth.world_from_camera);
-    // Where the camera of the depth image is the frame of reference.
-    let depth = Camera {
-        world_from_camera: color_from_depth,
-        ..depth.clone()
-    };
-    let color = Camera {
-        world_from_camera: nalgebra::Isometry3::identity(),
-        ..color.clone()
-    };
-    let (columns, rows) = (depth.intrinsics.width, depth.intrinsics.height);
-    for (index, &measured_m) in depth_m.iter().enumerate().take(columns * rows) {
-        if !(measured_m > 0.0 && measured_m.is_finite()) {
-            continue;
-        }
-        let center = Point2::new((index % columns) as f64, (index / columns) as f64);
-        let corner = |side: f64| {
-            let image = Point2::new(center.x + side, center.y + side);
-            let point = depth.back_project(&image, f64::from(measured_m));
-            color.project(&point)
-        };
-        let (Some((first, first_m)), Some((last, last_m))) = (corner(-0.5), corner(0.5)) else {
-            continue;
-        };
-        let span = |a: f64, b: f64, size: i64| {
-            // The pixels whose centres lie between; at least the nearest one. Casts clamp.
-            let (low, high) = (a.min(b), a.max(b));
-            let from = (low.ceil() as i64).min(((low + high) / 2.0).round() as i64);
-            let to = (high.ceil() as i64 - 1).max(from);
-            (to - from < MAX_FOOTPRINT_PX && to >= 0 && from < size)
-                .then(|| from.max(0)..=to.min(size - 1))
-        };
-        let (Some(us), Some(vs)) = (span(first.x, last.x, width), span(first.y, last.y, height))
-        else {
-            continue;
-        };
-        let seen_m = (0.5 * (first_m + last_m)) as f32;
-        for v in vs {
-            for u in us.clone() {
-                let out = &mut out_m[(v * width + u) as usize];
-                if *out == 0.0 || seen_m < *out {
-                    *out = seen_m;
+/// ```
+/// use heightmap::{Camera, DepthRegistration};
+/// use nalgebra::Isometry3;
+///
+/// let [color, ..] = Camera::ravens();
+/// let mut depth = color.clone();
+/// depth.world_from_camera *= Isometry3::translation(-0.05, 0.0, 0.0);
+/// let mut registered_m = Vec::new();
+/// DepthRegistration::default().register(&vec![0.9; 640 * 480], &depth, &color, &mut registered_m);
+/// assert!((registered_m[240 * 640 + 320] - 0.9).abs() < 1e-6);
+/// ```
+#[derive(Debug, Default)]
+pub struct DepthRegistration {
+    of: Option<Intrinsics>,
+    /// x and y, where z is 1, of the rays through the corners of the depth image's pixels, row by row, one more than pixels in each; not a
+    /// number where the lens shows nothing.
+    corners: Vec<[f64; 2]>,
+}
+
+impl DepthRegistration {
+    /// Registers a row-major depth image of the camera `depth` to the image of the camera `color`, both posed in one frame: what `color`
+    /// would have measured, in metres along its optical axis, 0 where it sees nothing of what `depth` has measured.
+    ///
+    /// Each depth pixel fills the pixels of the colour image that its own area covers there, and the nearest surface wins, as
+    /// librealsense's `align` does. `out_m` is overwritten.
+    pub fn register(
+        &mut self,
+        depth_m: &[f32],
+        depth: &Camera,
+        color: &Camera,
+        out_m: &mut Vec<f32>,
+    ) {
+        self.calibrate(&depth.intrinsics);
+        let (width, height) = (
+            color.intrinsics.width as i64,
+            color.intrinsics.height as i64,
+        );
+        out_m.clear();
+        out_m.resize(color.intrinsics.len(), 0.0);
+        let color_from_depth = color.world_from_camera.inv_mul(&depth.world_from_camera);
+        let (turn, shift) = (
+            color_from_depth.rotation.to_rotation_matrix(),
+            color_from_depth.translation.vector,
+        );
+        let (columns, rows) = (depth.intrinsics.width, depth.intrinsics.height);
+        for (index, &measured_m) in depth_m.iter().enumerate().take(columns * rows) {
+            if !(measured_m > 0.0 && measured_m.is_finite()) {
+                continue;
+            }
+            let (u, v) = (index % columns, index / columns);
+            let corner = |u: usize, v: usize| {
+                let [x, y] = self.corners[v * (columns + 1) + u];
+                let point = turn * Vector3::new(x, y, 1.0) * f64::from(measured_m) + shift;
+                // A ray that is none fails the comparison.
+                let image = (point.z > 0.0).then(|| color.intrinsics.image(&point.into()))??;
+                Some((image, point.z))
+            };
+            let (Some((first, first_m)), Some((last, last_m))) =
+                (corner(u, v), corner(u + 1, v + 1))
+            else {
+                continue;
+            };
+            let span = |a: f64, b: f64, size: i64| {
+                // The pixels whose centres lie between; at least the nearest one. Casts clamp.
+                let (low, high) = (a.min(b), a.max(b));
+                let from = (low.ceil() as i64).min(((low + high) / 2.0).round() as i64);
+                let to = (high.ceil() as i64 - 1).max(from);
+                (to - from < MAX_FOOTPRINT_PX && to >= 0 && from < size)
+                    .then(|| from.max(0)..=to.min(size - 1))
+            };
+            let (Some(us), Some(vs)) =
+                (span(first.x, last.x, width), span(first.y, last.y, height))
+            else {
+                continue;
+            };
+            let seen_m = (0.5 * (first_m + last_m)) as f32;
+            for v in vs {
+                for u in us.clone() {
+                    let out = &mut out_m[(v * width + u) as usize];
+                    if *out == 0.0 || seen_m < *out {
+                        *out = seen_m;
+                    }
                 }
             }
+        }
+    }
+
+    fn calibrate(&mut self, depth: &Intrinsics) {
+        if self.of == Some(*depth) {
+            return;
+        }
+        self.of = Some(*depth);
+        self.corners.clear();
+        for v in 0..=depth.height {
+            self.corners.extend((0..=depth.width).map(|u| {
+                let ray = depth.ray(&Point2::new(u as f64 - 0.5, v as f64 - 0.5));
+                [ray.x, ray.y]
+            }));
         }
     }
 }
@@ -93,7 +137,7 @@ pub fn register_depth(depth_m: &[f32], depth: &Camera, color: &Camera, out_m: &m
 mod tests {
     use super::*;
     use crate::Distortion;
-    use nalgebra::{Isometry3, Point3, Vector3};
+    use nalgebra::{Isometry3, Point3};
 
     const SMALL: Intrinsics = Intrinsics {
         width: 64,
@@ -158,6 +202,48 @@ mod tests {
     }
 
     #[test]
+    fn one_registration_serves_cameras_behind_any_lens_in_turn() {
+        let lenses = [
+            Distortion::NONE,
+            Distortion::plumb_bob([0.1, -0.05, 0.001, -0.002, 0.0]),
+            Distortion::rational([0.5, -0.2, 0.001, 0.0, 0.1, 0.4, -0.1, 0.05]),
+            Distortion::equidistant([-0.01, 0.03, 0.0, 0.0]),
+        ];
+        let beside = Isometry3::translation(-0.02, 0.0, 0.0);
+        let mut registration = DepthRegistration::default();
+        for depth_lens in lenses {
+            for color_lens in lenses {
+                let behind = |distortion, pose| {
+                    camera(
+                        Intrinsics {
+                            distortion,
+                            ..SMALL
+                        },
+                        pose,
+                    )
+                };
+                let depth = behind(depth_lens, beside);
+                let color = behind(color_lens, Isometry3::identity());
+                let (mut out_m, mut alone_m) = (Vec::new(), Vec::new());
+                let measured_m = see(&depth);
+                registration.register(&measured_m, &depth, &color, &mut out_m);
+                DepthRegistration::default().register(&measured_m, &depth, &color, &mut alone_m);
+                assert_eq!(out_m, alone_m);
+                let expected = see(&color);
+                let inside = (0..out_m.len()).filter(|index| {
+                    let (u, v) = (index % 64, index / 64);
+                    (8..56).contains(&u) && (6..42).contains(&v)
+                });
+                let good = inside
+                    .clone()
+                    .filter(|index| (out_m[*index] - expected[*index]).abs() < 2e-3);
+                let share = good.count() as f64 / inside.count() as f64;
+                assert!(share > 0.9, "{depth_lens:?} {color_lens:?}: {share}");
+            }
+        }
+    }
+
+    #[test]
     fn registered_depth_is_what_the_colour_camera_would_have_measured() {
         // The imagers of a stereo depth camera are some centimetres beside the colour camera, and turned by a little.
         let color = camera(SMALL, Isometry3::identity());
@@ -179,7 +265,7 @@ mod tests {
         ] {
             let depth = camera(intrinsics, beside);
             let mut out_m = Vec::new();
-            register_depth(&see(&depth), &depth, &color, &mut out_m);
+            DepthRegistration::default().register(&see(&depth), &depth, &color, &mut out_m);
             let expected = see(&color);
             let inside = |index: &usize| {
                 let (u, v) = (index % 64, index / 64);
@@ -206,7 +292,7 @@ mod tests {
             depth_m[200 + index] = hole;
         }
         let mut out_m = Vec::new();
-        register_depth(&depth_m, &one, &one, &mut out_m);
+        DepthRegistration::default().register(&depth_m, &one, &one, &mut out_m);
         for (index, &out) in out_m.iter().enumerate() {
             let expected = if (200..204).contains(&index) {
                 0.0
@@ -225,7 +311,7 @@ mod tests {
             Isometry3::rotation(Vector3::y() * std::f64::consts::PI),
         );
         let mut out_m = Vec::new();
-        register_depth(&see(&color), &depth, &color, &mut out_m);
+        DepthRegistration::default().register(&see(&color), &depth, &color, &mut out_m);
         assert!(out_m.iter().all(|depth| *depth == 0.0));
     }
 }

@@ -1,6 +1,6 @@
 //! Fusion for cameras with noise: the median of several frames of a still scene.
 
-use crate::fusion::{LensRays, from_ordered, ordered};
+use crate::fusion::{LensRays, OUTSIDE, Outline, floor, from_ordered, mean, ordered, whole};
 use crate::{FusionError, FusionReport, Heightmap, View, Workspace};
 use nalgebra::Vector3;
 use std::collections::VecDeque;
@@ -44,6 +44,12 @@ pub struct StillFusion {
     top: Vec<[u64; KEPT]>,
     /// By cell, its points.
     counts: Vec<u16>,
+    /// Cell of each pixel of an image row, or [`OUTSIDE`].
+    cells: Vec<u32>,
+    /// Ordered bits of the height of each pixel of an image row.
+    heights: Vec<u32>,
+    /// The median of the frames, once it was asked for.
+    median: Option<(Heightmap, FusionReport)>,
 }
 
 /// What one set of views shows.
@@ -71,6 +77,7 @@ impl StillFusion {
         for view in views {
             view.check()?;
         }
+        self.median = None;
         let len = workspace.len();
         self.top.clear();
         self.top.resize(len, [0; KEPT]);
@@ -102,6 +109,11 @@ impl StillFusion {
         frame.height_m.clear();
         frame.rgb.clear();
         let from_top = 1.0 - self.settings.percentile;
+        // Of more points than these the lowest one that is kept.
+        let ranks: [usize; 256] = std::array::from_fn(|count| {
+            let rank = (from_top * count.saturating_sub(1) as f64).round() as usize;
+            rank.min(KEPT - 1)
+        });
         for (top, count) in self.top.iter().zip(&self.counts) {
             let count = usize::from(*count);
             if count == 0 {
@@ -109,18 +121,14 @@ impl StillFusion {
                 frame.rgb.extend([0; 3]);
                 continue;
             }
-            let rank = (from_top * (count - 1) as f64).round() as usize;
-            let rank = rank.min(KEPT - 1);
+            let rank = ranks[count.min(ranks.len() - 1)];
             frame.height_m.push(from_ordered((top[rank] >> 32) as u32));
             let mut sums = [0; 3];
             for key in &top[..=rank] {
                 let [_, rgb @ ..] = (*key as u32).to_be_bytes().map(u32::from);
                 sums = [0, 1, 2].map(|channel| sums[channel] + rgb[channel]);
             }
-            let kept = rank as u32 + 1;
-            frame
-                .rgb
-                .extend(sums.map(|sum| ((sum + kept / 2) / kept) as u8));
+            frame.rgb.extend(mean(sums, rank as u32 + 1));
         }
         self.frames.push_back(frame);
         Ok(())
@@ -143,22 +151,42 @@ impl StillFusion {
 
     /// Forgets all frames: something has moved.
     pub fn forget(&mut self) {
+        self.median = None;
         self.frames.clear();
     }
 
     /// The last frame alone, to see whether something moves.
     pub fn last(&self, out: &mut Heightmap) {
-        let newest = self.frames.len().saturating_sub(1);
-        self.write(newest, out);
+        let Some(newest) = self.frames.back() else {
+            *out = Heightmap::new(out.workspace);
+            return;
+        };
+        out.workspace = newest.workspace;
+        out.height_m.clear();
+        out.rgb.clear();
+        for (height_m, rgb) in newest.height_m.iter().zip(newest.rgb.as_chunks::<3>().0) {
+            let (height_m, rgb) = match height_m.is_nan() {
+                true => (0.0, [0; 3]),
+                false => (*height_m, seen_color(*rgb)),
+            };
+            out.height_m.push(height_m);
+            out.rgb.extend(rgb);
+        }
     }
 
-    /// The median of the frames. Overwrites `out`.
-    pub fn median(&self, out: &mut Heightmap) -> FusionReport {
-        self.write(0, out)
+    /// The median of the frames. Overwrites `out`. It is computed once for the same frames.
+    pub fn median(&mut self, out: &mut Heightmap) -> FusionReport {
+        if let Some((median, report)) = &self.median {
+            out.clone_from(median);
+            return *report;
+        }
+        let report = self.write(out);
+        self.median = Some((out.clone(), report));
+        report
     }
 
-    /// The median of the frames from one on.
-    fn write(&self, first: usize, out: &mut Heightmap) -> FusionReport {
+    /// The median of the frames.
+    fn write(&self, out: &mut Heightmap) -> FusionReport {
         let Some(newest) = self.frames.back() else {
             *out = Heightmap::new(out.workspace);
             return FusionReport {
@@ -170,12 +198,11 @@ impl StillFusion {
         let len = newest.workspace.len();
         out.height_m.clear();
         out.rgb.clear();
-        let frames = self.frames.iter().skip(first);
-        let needed = frames.clone().count().div_ceil(2);
+        let needed = self.frames.len().div_ceil(2);
         let (mut heights, mut seen) = ([0.0f32; MAX_FRAMES], 0);
         for cell in 0..len {
             let (mut count, mut sums) = (0, [0u32; 3]);
-            for frame in frames.clone() {
+            for frame in &self.frames {
                 let height_m = frame.height_m[cell];
                 if height_m.is_nan() {
                     continue;
@@ -192,13 +219,14 @@ impl StillFusion {
                 continue;
             }
             seen += 1;
-            let heights = &mut heights[..count];
-            heights.sort_unstable_by(f32::total_cmp);
-            out.height_m.push(heights[(count - 1) / 2]);
-            let count = count as u32;
-            let rgb = sums.map(|sum| ((sum + count / 2) / count) as u8);
-            // Black at height 0 stands for what is not seen.
-            out.rgb.extend(if rgb == [0; 3] { [1; 3] } else { rgb });
+            out.height_m.push(match &mut heights[..count] {
+                &mut [a, b, c, d, e] => median_of_five([a, b, c, d, e]),
+                heights => {
+                    heights.sort_unstable_by(f32::total_cmp);
+                    heights[(count - 1) / 2]
+                }
+            });
+            out.rgb.extend(seen_color(mean(sums, count as u32)));
         }
         FusionReport {
             views: newest.views,
@@ -228,40 +256,61 @@ impl StillFusion {
         let (cols, rows) = (workspace.cols as f32, workspace.rows as f32);
         let (z_min_m, z_max_m) = (workspace.z_min_m as f32, workspace.z_max_m as f32);
         let step_m = self.settings.edge_step_m;
+        let deep = Workspace {
+            z_min_m: workspace.z_min_m - f64::from(BELOW_M),
+            ..*workspace
+        };
+        let outline = Outline::new(view.camera, &deep);
+        let z_low_m = z_min_m - BELOW_M;
+        self.cells.resize(width, 0);
+        self.heights.resize(width, 0);
         for v in 0..height {
+            // Most pixels see only what is beside the workspace.
+            let columns = outline.columns(v, width);
             let row = &view.depth_m[v * width..][..width];
-            let above = (v > 0).then(|| &view.depth_m[(v - 1) * width..][..width]);
-            let below = (v + 1 < height).then(|| &view.depth_m[(v + 1) * width..][..width]);
-            for u in 0..width {
+            // Two loops, since this one can be done for several pixels at once and the next cannot.
+            let places = self.cells.iter_mut().zip(&mut self.heights);
+            let seen = row[columns.clone()].iter();
+            let rays = &rays[v * width..][columns.clone()];
+            for (((cell, ordered_z), &depth_m), &[ray_x, ray_y]) in places.zip(seen).zip(rays) {
+                let at = |axis: usize| {
+                    let ray = right[axis] * ray_x + down[axis] * ray_y + ahead[axis];
+                    ray * depth_m + origin[axis]
+                };
+                let (x, y, z_m) = (at(0), at(1), at(2));
+                // A depth that is not a number fails every comparison; infinity is outside.
+                let inside = (depth_m > 0.0)
+                    & (x >= 0.0)
+                    & (x < cols)
+                    & (y >= 0.0)
+                    & (y < rows)
+                    & (z_m >= z_low_m)
+                    & (z_m <= z_max_m);
+                let index = whole(floor(y) * cols + floor(x));
+                *cell = if inside { index } else { OUTSIDE };
+                *ordered_z = ordered(z_m.max(z_min_m));
+            }
+            // A pixel at the border of the image is its own neighbour.
+            let neighbor = |v: usize| &view.depth_m[v.min(height - 1) * width..][..width];
+            let (above, below) = (neighbor(v.saturating_sub(1)), neighbor(v + 1));
+            let places = self.cells.iter().zip(&self.heights);
+            for (u, (&cell, &ordered_z)) in columns.zip(places) {
+                if cell == OUTSIDE {
+                    continue;
+                }
                 let depth_m = row[u];
-                // Infinity is outside, below.
-                if depth_m.is_nan() || depth_m <= 0.0 {
-                    continue;
-                }
-                let [ray_x, ray_y] = rays[v * width + u];
-                let ray = right * ray_x + down * ray_y + ahead;
-                let point = ray * depth_m + origin;
-                let inside = (point.x >= 0.0)
-                    & (point.x < cols)
-                    & (point.y >= 0.0)
-                    & (point.y < rows)
-                    & (point.z >= z_min_m - BELOW_M)
-                    & (point.z <= z_max_m);
-                if !inside {
-                    continue;
-                }
-                let jumps = |other: f32| other > 0.0 && (other - depth_m).abs() > step_m;
-                let at_edge = (u > 0 && jumps(row[u - 1]))
-                    || (u + 1 < width && jumps(row[u + 1]))
-                    || above.is_some_and(|above| jumps(above[u]))
-                    || below.is_some_and(|below| jumps(below[u]));
+                let jumps = |other: f32| (other > 0.0) & ((other - depth_m).abs() > step_m);
+                let at_edge = jumps(row[u.saturating_sub(1)])
+                    | jumps(row[(u + 1).min(width - 1)])
+                    | jumps(above[u])
+                    | jumps(below[u]);
                 if at_edge {
                     continue;
                 }
-                let cell = point.y as usize * workspace.cols + point.x as usize;
+                let cell = cell as usize;
                 let color = &view.rgb[3 * (v * width + u)..][..3];
                 let color = u32::from_be_bytes([0, color[0], color[1], color[2]]);
-                let key = (u64::from(ordered(point.z.max(z_min_m))) << 32) | u64::from(color);
+                let key = (u64::from(ordered_z) << 32) | u64::from(color);
                 self.counts[cell] = self.counts[cell].saturating_add(1);
                 let top = &mut self.top[cell];
                 if key > top[KEPT - 1] {
@@ -275,6 +324,20 @@ impl StillFusion {
             }
         }
     }
+}
+
+/// Black at height 0 stands for what is not seen.
+fn seen_color(rgb: [u8; 3]) -> [u8; 3] {
+    if rgb == [0; 3] { [1; 3] } else { rgb }
+}
+
+/// The third of five numbers, without a branch.
+fn median_of_five([a, b, c, d, e]: [f32; 5]) -> f32 {
+    // The lowest and the highest of two pairs cannot be it.
+    let low = a.min(b).max(c.min(d));
+    let high = a.max(b).min(c.max(d));
+    // The median of these two and the fifth.
+    low.min(high).max(low.max(high).min(e))
 }
 
 /// Noise puts points of the table below it: up to this far below the workspace they count as its lowest height.
@@ -425,6 +488,76 @@ mod tests {
             "{}",
             lifted.count()
         );
+    }
+
+    #[test]
+    fn the_median_is_that_of_the_present_frames_however_often_it_is_asked_for() {
+        let mut fusion = fusion(3);
+        let mut out = Heightmap::new(Workspace::RAVENS);
+        for depth_m in [0.95, 0.9, 0.85, 0.8] {
+            push(&mut fusion, &vec![depth_m; SMALL.len()], 90);
+            let mut fresh = Heightmap::new(Workspace::RAVENS);
+            let report = fusion.median(&mut fresh);
+            assert_eq!(fusion.median(&mut out), report);
+            assert_eq!(out, fresh);
+        }
+        assert!((out.height_m[middle()] - 0.15).abs() < 1e-5);
+        fusion.forget();
+        assert_eq!(fusion.median(&mut out).views, 0);
+        assert_eq!(out, Heightmap::new(Workspace::RAVENS));
+    }
+
+    #[test]
+    fn a_pinhole_and_a_lens_that_changes_nothing_give_the_same_cells() {
+        // What the outline of the workspace leaves out is beside it: behind a lens every pixel is looked at.
+        let mut lens = Intrinsics::RAVENS;
+        lens.distortion = Distortion::plumb_bob([1e-12, 0.0, 0.0, 0.0, 0.0]);
+        for camera in Camera::ravens() {
+            let depth_m: Vec<f32> = (0..Intrinsics::RAVENS.len())
+                .map(|index| 0.6 + (index % 640) as f32 * 1e-3)
+                .collect();
+            let rgb: Vec<u8> = (0..3 * depth_m.len()).map(|i| (i % 251) as u8).collect();
+            let fused = |intrinsics| {
+                let camera = Camera {
+                    intrinsics,
+                    ..camera.clone()
+                };
+                let view = View {
+                    camera: &camera,
+                    rgb: &rgb,
+                    depth_m: &depth_m,
+                };
+                let mut fusion = fusion(1);
+                fusion.push(&[view], &Workspace::RAVENS).unwrap();
+                let mut out = Heightmap::new(Workspace::RAVENS);
+                fusion.median(&mut out);
+                out
+            };
+            let (pinhole, bent) = (fused(Intrinsics::RAVENS), fused(lens));
+            let differ = pinhole.height_m.iter().zip(&bent.height_m);
+            let differ = differ.filter(|(a, b)| (*a - *b).abs() > 1e-6).count();
+            // A point on a cell's edge may go either way.
+            assert!(differ <= 2, "{}: {differ}", camera.name);
+            assert!(pinhole.height_m.iter().any(|height| *height > 0.0));
+        }
+    }
+
+    #[test]
+    fn the_median_of_five_is_the_third_in_every_order() {
+        let mut orders = vec![Vec::new()];
+        for _ in 0..5 {
+            let longer = orders.iter().flat_map(|order: &Vec<u8>| {
+                let left = (0..5).filter(|number| !order.contains(number));
+                left.map(|number| [order.as_slice(), &[number]].concat())
+            });
+            orders = longer.collect();
+        }
+        assert_eq!(orders.len(), 120);
+        for order in orders {
+            let numbers = [0, 1, 2, 3, 4].map(|at: usize| f32::from(order[at]));
+            assert_eq!(median_of_five(numbers), 2.0, "{order:?}");
+        }
+        assert_eq!(median_of_five([0.1, 0.1, 0.3, 0.1, -0.2]), 0.1);
     }
 
     #[test]

@@ -179,18 +179,6 @@ impl Heightmap {
         self.height_m[index] != 0.0 || self.rgb[3 * index..3 * index + 3] != [0; 3]
     }
 
-    /// Share of cells whose height differs by more than `tolerance_m`: how much the scene changed. All
-    /// of it if the heightmaps cover different workspaces.
-    pub fn changed_fraction(&self, other: &Self, tolerance_m: f32) -> f64 {
-        if self.workspace != other.workspace || self.height_m.len() != other.height_m.len() {
-            return 1.0;
-        }
-        let same = |(a, b): &(&f32, &f32)| (*a - *b).abs() <= tolerance_m;
-        let pairs = self.height_m.iter().zip(&other.height_m);
-        let changed = pairs.filter(|pair| !same(pair)).count();
-        changed as f64 / self.workspace.len() as f64
-    }
-
     /// How different two scenes look: the mean over cells of the colour difference (of the full range) and the
     /// height difference (of 4 cm, and no more than that). Infinite if the heightmaps cover different
     /// workspaces.
@@ -286,25 +274,6 @@ mod tests {
         for workspace in bad {
             assert!(workspace.check().is_err(), "{workspace:?}");
         }
-    }
-
-    #[test]
-    fn changes_are_counted_cell_by_cell() {
-        let before = Heightmap::new(Workspace::RAVENS);
-        let mut after = before.clone();
-        after.height_m[..512].fill(0.01);
-        assert_eq!(before.changed_fraction(&after, 0.005), 0.01);
-        assert_eq!(before.changed_fraction(&after, 0.02), 0.0);
-        after.height_m[0] = f32::NAN;
-        assert_eq!(before.changed_fraction(&after, 0.02), 1.0 / 51200.0);
-        let elsewhere = Workspace {
-            z_max_m: 0.5,
-            ..Workspace::RAVENS
-        };
-        assert_eq!(
-            before.changed_fraction(&Heightmap::new(elsewhere), 0.005),
-            1.0
-        );
     }
 
     #[test]

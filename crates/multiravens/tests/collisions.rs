@@ -1,6 +1,6 @@
 //! How often the check of motions refuses what demonstrators do.
 
-use collision::{CollisionChecker, Margins, rehearse};
+use collision::{CollisionChecker, Margins, Situation, rehearse};
 use heightmap::Heightmap;
 use multiravens::{Environment, Problem};
 use nalgebra::Point2;
@@ -27,15 +27,13 @@ fn refusals(problem: &str, seeds: &[u64]) -> (usize, Vec<String>, usize) {
             count += 1;
             let check = |heightmap: &Heightmap| {
                 let (arm, home) = (&cell.arm, &cell.arm.home);
-                rehearse(
-                    &checker,
-                    arm,
-                    &action,
-                    &settings,
-                    home,
-                    false,
-                    Some(heightmap),
-                )
+                let situation = Situation {
+                    joints: home,
+                    holds: false,
+                    heightmap: Some(heightmap),
+                    touchdown: None,
+                };
+                rehearse(&checker, arm, &action, &settings, &situation)
             };
             if let Err(error) = check(&heightmap) {
                 refused.push(format!("{problem} {seed}: {error}"));

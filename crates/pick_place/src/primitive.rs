@@ -109,6 +109,9 @@ pub enum PrimitiveError {
     /// Suction already holds something.
     #[error("the gripper already holds something, expected it to be empty")]
     AlreadyHolding,
+    /// There is nothing to put down.
+    #[error("the gripper holds nothing, expected something to put down")]
+    HoldsNothing,
     /// The arm lagged behind with nothing held: something is in its way.
     #[error("{phase:?}: the arm lags behind although it holds nothing, something is in its way")]
     Blocked { phase: Phase },
@@ -121,6 +124,11 @@ pub enum PrimitiveError {
         height_m: f64,
         highest_m: f64,
     },
+    /// What is held met nothing where contact was expected.
+    #[error(
+        "{phase:?}: no contact down to a height of {height_m:.4} m, which ends the window in which it is expected: what is held stays held"
+    )]
+    MissedContact { phase: Phase, height_m: f64 },
     /// A report that does not answer the last command.
     #[error("{phase:?}: {report:?} does not answer the last command")]
     UnexpectedReport { phase: Phase, report: Report },
@@ -175,6 +183,47 @@ enum Descent {
     Press,
 }
 
+impl PickPlace {
+    /// x (m), y (m), yaw (rad) of the pick, then of the place.
+    ///
+    /// ```
+    /// let action = pick_place::PickPlace::from_array([0.3, 0.1, 0.0, 0.5, -0.2, 1.5]);
+    /// assert_eq!(action.to_array()[3..], [0.5, -0.2, 1.5]);
+    /// ```
+    pub fn to_array(&self) -> [f64; 6] {
+        let pose = |pose: &Isometry2<f64>| {
+            let position = pose.translation.vector;
+            [position.x, position.y, pose.rotation.angle()]
+        };
+        let ([a, b, c], [d, e, f]) = (pose(&self.pick), pose(&self.place));
+        [a, b, c, d, e, f]
+    }
+
+    /// The action of [`PickPlace::to_array`].
+    pub fn from_array([x, y, yaw, to_x, to_y, to_yaw]: [f64; 6]) -> Self {
+        Self {
+            pick: Isometry2::new([x, y].into(), yaw),
+            place: Isometry2::new([to_x, to_y].into(), to_yaw),
+        }
+    }
+
+    /// Poses of the tip at pick and place. The cup is round: only the turn from pick to place counts. Half of it before and half after keeps
+    /// wrist 3 away from its limits.
+    pub fn tips(&self) -> (Isometry2<f64>, Isometry2<f64>) {
+        let mut half_turn = 0.5 * self.pick.rotation.angle_to(&self.place.rotation);
+        // A full half-circle may go either way. Begun from this side, both are within the limits.
+        if half_turn < -FRAC_PI_2 + 1e-6 {
+            half_turn += PI;
+        }
+        let turned =
+            |pose: &Isometry2<f64>, yaw_rad| Isometry2::new(pose.translation.vector, yaw_rad);
+        (
+            turned(&self.pick, -half_turn),
+            turned(&self.place, half_turn),
+        )
+    }
+}
+
 impl<'a> Primitive<'a> {
     /// Checks settings and reach before anything moves. `joints` is where the arm is.
     ///
@@ -202,23 +251,17 @@ impl<'a> Primitive<'a> {
         };
         // The object may stand on others: as high as lift and clearance together could ask for.
         let wanted_m = settings.clearance_m + settings.lift_m;
-        let pick = ceiling("pick", &action.pick, wanted_m)?;
-        let place = ceiling("place", &action.place, wanted_m)?;
-        // The cup is round: only the turn from pick to place counts. Half of it before and half
-        // after keeps wrist 3 away from its limits.
-        let mut half_turn = 0.5 * action.pick.rotation.angle_to(&action.place.rotation);
-        // A full half-circle may go either way. Begun from this side, both are within the limits.
-        if half_turn < -FRAC_PI_2 + 1e-6 {
-            half_turn += PI;
-        }
-        let turned =
-            |pose: &Isometry2<f64>, yaw_rad| Isometry2::new(pose.translation.vector, yaw_rad);
+        let ceilings_m = (
+            ceiling("pick", &action.pick, wanted_m)?,
+            ceiling("place", &action.place, wanted_m)?,
+        );
+        let (pick, place) = action.tips();
         Ok(Self {
             arm,
-            pick: turned(&action.pick, -half_turn),
-            place: turned(&action.place, half_turn),
+            pick,
+            place,
             settings: *settings,
-            ceiling_m: (pick, place),
+            ceiling_m: ceilings_m,
             phase: Phase::Approach,
             approaching: false,
             joints: *joints,
@@ -320,14 +363,25 @@ impl<'a> Primitive<'a> {
                 self.phase = Phase::DescendToPlace;
                 self.begin_descent()?
             }
-            (Phase::DescendToPlace, Report::Contact(_) | Report::NoContact(_)) => {
-                if let Report::Contact(_) = report {
-                    self.check_contact()?;
-                }
+            (Phase::DescendToPlace, Report::Contact(_)) => {
+                self.check_contact()?;
                 self.phase = Phase::Release;
                 Command::ReadVacuum
             }
-            (Phase::Transfer | Phase::Release, Report::Holds(false)) => {
+            (Phase::DescendToPlace, Report::NoContact(_)) => {
+                if self.window().is_none() {
+                    self.phase = Phase::Release;
+                }
+                Command::ReadVacuum
+            }
+            // Down to the end of the window, and still in the air: it would fall.
+            (Phase::DescendToPlace, Report::Holds(true)) => {
+                return Err(PrimitiveError::MissedContact {
+                    phase: self.phase,
+                    height_m: self.height_m(),
+                });
+            }
+            (Phase::Transfer | Phase::DescendToPlace | Phase::Release, Report::Holds(false)) => {
                 self.give_up(Outcome::Dropped)
             }
             (Phase::Release, Report::Holds(true)) => Command::SetSuction(false),
@@ -443,9 +497,14 @@ impl<'a> Primitive<'a> {
             .map(Command::FollowUntilContact)
     }
 
+    /// Where the contact of the descent under way is expected, and sensed.
+    fn window(&self) -> Option<Touchdown> {
+        self.touchdown.filter(|touchdown| self.senses(touchdown))
+    }
+
     /// Refuses contact above the surface that was seen.
     fn check_contact(&self) -> Result<(), PrimitiveError> {
-        let Some(touchdown) = self.touchdown.filter(|touchdown| self.senses(touchdown)) else {
+        let Some(touchdown) = self.window() else {
             return Ok(());
         };
         let (height_m, highest_m) = (
@@ -534,7 +593,11 @@ impl<'a> Primitive<'a> {
 }
 
 /// The highest that the tip can go over a pose, at most `wanted_m`.
-fn ceiling_m(arm: &Arm, pose: &Isometry2<f64>, wanted_m: f64) -> Result<f64, Unreachable> {
+pub(crate) fn ceiling_m(
+    arm: &Arm,
+    pose: &Isometry2<f64>,
+    wanted_m: f64,
+) -> Result<f64, Unreachable> {
     arm.solve(&Arm::tip_down(pose, LOWEST_M), &arm.ready)?;
     let least = Arm::tip_down(pose, LEAST_RISE_M + STRETCH_MARGIN_M);
     arm.solve(&least, &arm.ready)?;

@@ -96,13 +96,7 @@ pub fn go_home<R: Robot>(
     settings.check().map_err(PrimitiveError::from)?;
     let plan_error = |phase| move |reason| PrimitiveError::Plan { phase, reason };
     let robot_error = |phase| move |error| ExecuteError::Robot { phase, error };
-    let phase = Phase::Retreat;
-    let joints = robot.joints().map_err(robot_error(phase))?;
-    if let Some(rise) = plan_rise(arm, settings, &joints).map_err(plan_error(phase))?
-        && !robot.follow(&rise).map_err(robot_error(phase))?
-    {
-        return Err(PrimitiveError::Blocked { phase }.into());
-    }
+    rise_of(robot, arm, settings)?;
     let phase = Phase::Home;
     let joints = robot.joints().map_err(robot_error(phase))?;
     let way = JointTrajectory::joint_space_within(arm, &joints, &arm.home, settings.travel_m_s)
@@ -115,7 +109,32 @@ pub fn go_home<R: Robot>(
     Ok(())
 }
 
-fn carry_out<R: Robot>(robot: &mut R, command: &Command) -> Result<Report, R::Error> {
+/// Straight up to the clearance, from wherever the arm stands.
+pub(crate) fn rise_of<R: Robot>(
+    robot: &mut R,
+    arm: &Arm,
+    settings: &PrimitiveSettings,
+) -> Result<(), ExecuteError<R::Error>> {
+    let phase = Phase::Retreat;
+    let joints = robot
+        .joints()
+        .map_err(|error| ExecuteError::Robot { phase, error })?;
+    let rise = plan_rise(arm, settings, &joints)
+        .map_err(|reason| PrimitiveError::Plan { phase, reason })?;
+    if let Some(rise) = rise {
+        let followed = robot.follow(&rise);
+        if !followed.map_err(|error| ExecuteError::Robot { phase, error })? {
+            return Err(PrimitiveError::Blocked { phase }.into());
+        }
+    }
+    Ok(())
+}
+
+/// Has a robot carry out one command of a primitive, and says what the primitive hears of it.
+///
+/// # Errors
+/// The robot did not do what it was told.
+pub fn carry_out<R: Robot>(robot: &mut R, command: &Command) -> Result<Report, R::Error> {
     Ok(match command {
         Command::Follow(trajectory) => match robot.follow(trajectory)? {
             true => Report::Arrived(robot.joints()?),

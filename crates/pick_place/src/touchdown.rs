@@ -1,6 +1,47 @@
 //! How the tip comes down on surfaces that were seen.
 
+use serde::{Deserialize, Serialize};
+
 use crate::SettingsError;
+
+/// What tells that the tool touches something.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
+#[serde(rename_all = "snake_case")]
+pub enum ContactSign {
+    /// The driver's action `trajectory_until_node`: e-Series only.
+    #[default]
+    UntilAction,
+    /// The vacuum sensor, suction being on while the tip comes down.
+    Vacuum,
+    /// Nothing: the end of the way down is taken for the contact.
+    Height,
+}
+
+/// How the tip comes down on surfaces that were seen.
+#[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default, deny_unknown_fields)]
+pub struct ContactSettings {
+    /// So far above the surface the tip slows down (m); 0: descents are fast to their end.
+    pub slow_from_m: f64,
+    /// Speed of the tip from there on (m/s).
+    pub slow_m_s: f64,
+    /// Contact higher than expected by more is a fault, and a descent ends so far below the surface (m). What is held is never let go there
+    /// without contact, where that is sensed.
+    pub window_m: f64,
+    /// The cup is pressed on by so much after contact (m).
+    pub press_m: f64,
+}
+
+impl Default for ContactSettings {
+    fn default() -> Self {
+        Self {
+            slow_from_m: 0.0,
+            slow_m_s: 0.05,
+            window_m: 0.015,
+            press_m: 0.0,
+        }
+    }
+}
 
 /// Heights of the surfaces under pick and place, and how the tip comes down on them.
 #[derive(Clone, Copy, Debug, PartialEq)]

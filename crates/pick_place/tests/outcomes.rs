@@ -2,8 +2,8 @@
 
 use nalgebra::{Isometry2, Vector2};
 use pick_place::{
-    ExecuteError, Outcome, Phase, PickPlace, Primitive, PrimitiveError, PrimitiveSettings, Report,
-    Robot, Touchdown, execute, execute_on, go_home,
+    ExecuteError, Outcome, Phase, PickPlace, Primitive, PrimitiveError, PrimitiveSettings, PutDown,
+    Report, Robot, Touchdown, execute, execute_on, go_home, put_down,
 };
 use ur5::{Arm, JointTrajectory, Joints, WorkCell};
 
@@ -474,6 +474,93 @@ fn after_a_fault_the_arm_can_be_taken_home_with_what_it_holds() {
     }
 }
 
+/// Where the pick has lifted it from.
+fn back() -> PutDown {
+    PutDown {
+        at: action().tips().0,
+        contact_m: 0.04,
+        slow_from_m: 0.03,
+        slow_m_s: 0.05,
+        window_m: 0.015,
+        senses: true,
+    }
+}
+
+#[test]
+fn after_a_fault_what_is_held_is_put_down_where_it_was_picked() {
+    // Lift, transfer and the descent to the place.
+    for motion in 2..5 {
+        let mut robot = ScriptedRobot::new();
+        robot.stops_in = Some(motion);
+        robot.run(&PrimitiveSettings::RIGID).0.unwrap_err();
+        robot.stops_in = None;
+        robot.contacts_m = [Some(0.04); 2];
+        assert!(robot.suction, "motion {motion}");
+        let (arm, commands) = (robot.arm.clone(), robot.seen.len());
+        put_down(&mut robot, &arm, &back(), &PrimitiveSettings::RIGID).unwrap();
+        assert!(robot.is_home() && !robot.suction);
+        let seen = &robot.seen[commands..];
+        let release = seen.iter().position(|seen| *seen == Seen::Suction(false));
+        let Seen::Descend { height_m } = seen[release.unwrap() - 1] else {
+            panic!("{seen:?}");
+        };
+        assert!((height_m - 0.04).abs() < 1e-3, "{seen:?}");
+        // Slowly from 30 mm above it, and straight down: the tip turned as at the pick.
+        let descent = &robot.path[robot.path.len() - 3];
+        let start = arm.tip(&descent.points()[0].positions_rad);
+        assert!((start.translation.z - 0.07).abs() < 1e-3, "{start}");
+        let expected = Arm::tip_down(&back().at, 0.07);
+        assert!(start.rotation.angle_to(&expected.rotation) < 1e-3);
+    }
+}
+
+#[test]
+fn nothing_is_put_down_that_is_not_held_or_meets_something_too_early_or_nothing() {
+    let arm = WorkCell::builtin().unwrap().arm;
+    let mut robot = ScriptedRobot::new();
+    let error = put_down(&mut robot, &arm, &back(), &PrimitiveSettings::RIGID).unwrap_err();
+    assert_eq!(error, ExecuteError::Primitive(PrimitiveError::HoldsNothing));
+    assert!(robot.seen.is_empty());
+    let mut robot = ScriptedRobot::new();
+    robot.stops_in = Some(3);
+    robot.run(&PrimitiveSettings::RIGID).0.unwrap_err();
+    robot.stops_in = None;
+    // Somebody has put something there.
+    robot.contacts_m = [Some(0.06); 2];
+    let error = put_down(&mut robot, &arm, &back(), &PrimitiveSettings::RIGID).unwrap_err();
+    let ExecuteError::Primitive(PrimitiveError::UnexpectedContact {
+        phase: Phase::DescendToPlace,
+        height_m,
+        highest_m,
+    }) = error
+    else {
+        panic!("{error}");
+    };
+    // It is noticed at the next point of the way down.
+    assert!((0.059..=0.06).contains(&height_m), "{height_m}");
+    assert!((highest_m - 0.055).abs() < 1e-9, "{highest_m}");
+    // It holds what it held.
+    assert!(robot.suction);
+    // What stood under it is gone.
+    robot.descents = 0;
+    robot.contacts_m = [None; 2];
+    let error = put_down(&mut robot, &arm, &back(), &PrimitiveSettings::RIGID).unwrap_err();
+    assert!(
+        error.to_string().contains("DescendToPlace: no contact"),
+        "{error}"
+    );
+    assert!(robot.suction);
+    let far = PutDown {
+        at: Isometry2::new(Vector2::new(3.0, 0.0), 0.0),
+        ..back()
+    };
+    let error = put_down(&mut robot, &arm, &far, &PrimitiveSettings::RIGID).unwrap_err();
+    assert!(
+        error.to_string().contains("put-down pose is out of reach"),
+        "{error}"
+    );
+}
+
 #[test]
 fn a_report_that_answers_another_command_is_refused() {
     let arm = WorkCell::builtin().unwrap().arm;
@@ -662,6 +749,42 @@ fn what_is_held_is_put_down_by_height_where_only_the_empty_tool_senses_contact()
     });
     // Not to below the table: the object hangs below the tip, as high as it stood.
     assert!((end_m.unwrap() - 0.041).abs() < 1e-3, "{end_m:?}");
+}
+
+#[test]
+fn what_is_held_stays_held_where_contact_is_expected_and_does_not_come() {
+    let mut robot = ScriptedRobot::new();
+    robot.contacts_m = [Some(0.041), None];
+    let error = robot.run_on(&TOUCHDOWN).unwrap_err();
+    let ExecuteError::Primitive(PrimitiveError::MissedContact {
+        phase: DescendToPlace,
+        height_m,
+    }) = error
+    else {
+        panic!("{error}");
+    };
+    // The window is 10 mm, the table at 0.
+    assert!((height_m + 0.01).abs() < 1e-6, "{height_m}");
+    assert_eq!(suctions(&robot), [true]);
+    assert!(!robot.is_home());
+
+    // Where it was lost on the way down there is nothing to hold.
+    let mut robot = ScriptedRobot::new();
+    robot.contacts_m = [Some(0.041), None];
+    // Motions: 0 approach, 1 and 2 descent, 3 lift, 4 transfer, 5 and 6 descent.
+    robot.drops_at = Some(6);
+    assert_eq!(robot.run_on(&TOUCHDOWN), Ok(Outcome::Dropped));
+    assert_eq!(suctions(&robot), [true, false]);
+    assert!(robot.is_home());
+}
+
+#[test]
+fn without_known_surfaces_what_is_held_is_released_at_the_end_of_the_way_down() {
+    let mut robot = ScriptedRobot::new();
+    robot.contacts_m = [Some(0.04), None];
+    let (outcome, _) = robot.run(&PrimitiveSettings::RIGID);
+    assert_eq!(outcome, Ok(Outcome::Placed));
+    assert_eq!(suctions(&robot), [true, false]);
 }
 
 #[test]

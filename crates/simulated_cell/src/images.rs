@@ -2,6 +2,7 @@
 
 use std::time::Duration;
 
+use camera_noise::Rig;
 use heightmap::Camera;
 use multiravens::render::{RenderError, RgbdImage};
 
@@ -27,7 +28,64 @@ pub struct Shot<'a> {
     pub time: Duration,
 }
 
+/// A still scene before the cameras: rendered once, taken any number of times, on any thread.
+#[derive(Clone, Debug)]
+pub struct StillScene {
+    cameras: Vec<Camera>,
+    images: Vec<RgbdImage>,
+    rig: Option<Rig>,
+}
+
+impl StillScene {
+    /// The cameras, as they truly stand.
+    pub fn cameras(&self) -> &[Camera] {
+        &self.cameras
+    }
+
+    /// What a camera takes of it in a set of images, with noise of that set; nothing where the camera is missing.
+    pub fn take(&self, index: usize, set: u64) -> Option<RgbdImage> {
+        let mut image = self.images[index].clone();
+        if let Some(rig) = &self.rig {
+            if rig.is_missing(index) {
+                return None;
+            }
+            let intrinsics = &self.cameras[index].intrinsics;
+            rig.apply(index, intrinsics, set, &mut image.rgb, &mut image.depth_m);
+        }
+        Some(image)
+    }
+
+    /// When a camera takes its image of a set that begins at a time: noisy cameras run free.
+    pub fn time_of(&self, index: usize, begin: Duration) -> Duration {
+        match &self.rig {
+            Some(_) => begin + index as u32 * NOISY_OFFSET,
+            None => begin,
+        }
+    }
+}
+
 impl SimulatedCell {
+    /// What is before the cameras now.
+    ///
+    /// # Errors
+    /// When the scene cannot be rendered.
+    pub fn still(&mut self) -> Result<StillScene, RenderError> {
+        let rig = self.environment.rig().cloned();
+        let cell = self.environment.cell_mut();
+        Ok(StillScene {
+            cameras: cell.cameras().to_vec(),
+            images: cell.render()?.to_vec(),
+            rig,
+        })
+    }
+
+    /// The number of the next set of images that noisy cameras take.
+    pub fn count_set(&mut self) -> u64 {
+        let set = self.sets_taken;
+        self.sets_taken += 1;
+        set
+    }
+
     /// Takes images with all cameras: one set with perfect ones; with noisy ones as many as their model says, one after the other, each image with
     /// noise of its own, and without those of a missing camera.
     ///
@@ -38,12 +96,10 @@ impl SimulatedCell {
         mut each: impl FnMut(Shot<'_>) -> Result<(), E>,
     ) -> Result<(), E> {
         let time = self.time();
-        let rig = self.environment.rig().cloned();
-        let cell = self.environment.cell_mut();
-        let cameras = cell.cameras().to_vec();
-        let views = cameras.iter().zip(cell.render()?).enumerate();
-        let Some(rig) = rig else {
-            for (index, (camera, image)) in views {
+        let Some(rig) = self.environment.rig() else {
+            let cell = self.environment.cell_mut();
+            let cameras = cell.cameras().to_vec();
+            for (index, (camera, image)) in cameras.iter().zip(cell.render()?).enumerate() {
                 each(Shot {
                     set: 0,
                     index,
@@ -54,30 +110,24 @@ impl SimulatedCell {
             }
             return Ok(());
         };
-        let sets = rig.model().frames as u32;
+        let sets = rig.model().frames;
+        let still = self.still()?;
         for set in 0..sets {
-            for (index, (camera, image)) in views.clone() {
-                if rig.is_missing(index) {
+            let number = self.count_set();
+            let begin = time + set as u32 * NOISY_PERIOD;
+            for (index, camera) in still.cameras().iter().enumerate() {
+                let Some(image) = still.take(index, number) else {
                     continue;
-                }
-                let mut image = image.clone();
-                rig.apply(
-                    index,
-                    &camera.intrinsics,
-                    self.sets_taken + u64::from(set),
-                    &mut image.rgb,
-                    &mut image.depth_m,
-                );
+                };
                 each(Shot {
-                    set: set as usize,
+                    set,
                     index,
                     camera,
                     image: &image,
-                    time: time + set * NOISY_PERIOD + index as u32 * NOISY_OFFSET,
+                    time: still.time_of(index, begin),
                 })?;
             }
         }
-        self.sets_taken += u64::from(sets);
         Ok(())
     }
 

@@ -24,11 +24,11 @@ use std::collections::BTreeMap;
 use std::time::Duration;
 
 use camera_noise::Perturbation;
-use driver_model::{HardwareSettings, PathDeviation, Servo, Vacuum};
+use driver_model::{HardwareSettings, PathDeviation, Servo, Vacuum, Valves};
 use multiravens::{Assessment, CellError, Environment, EnvironmentError, MotionEnd, Problem, Tick};
 use ur5::{JointTrajectory, Joints, PlanError, WorkCell};
 
-pub use self::images::{NOISY_PERIOD, Shot};
+pub use self::images::{NOISY_PERIOD, Shot, StillScene};
 
 /// Digital pins of a UR controller: 0 to 7 standard, 8 to 15 configurable, 16 and 17 at the tool.
 const PINS: u8 = 18;
@@ -80,7 +80,7 @@ pub enum InvalidOutput {
         /// The last one.
         last: u8,
     },
-    /// A level that is none.
+    /// The level of the pin is neither 0 nor 1.
     #[error("state is {0}, expected 0 or 1")]
     Level(f32),
     /// A voltage that the tool cannot be fed with.
@@ -160,6 +160,8 @@ pub enum BeginError {
     Cell(#[from] CellError),
 }
 
+/// Session of perturbed cameras: light, colours and noise are those of another day than a demonstration's of the same seed.
+const SESSION: u64 = 1;
 /// Time between the end of an episode and the beginning of the next.
 const PAUSE: Duration = Duration::from_secs(1);
 
@@ -198,6 +200,7 @@ struct Followed {
     desired: JointTrajectory,
     actual: JointTrajectory,
     tolerances_rad: Joints,
+    until_contact: bool,
     begin: Duration,
 }
 
@@ -229,6 +232,7 @@ impl SimulatedCell {
     ) -> Result<Self, EnvironmentError> {
         let mut environment = Environment::new(problem, work_cell);
         environment.set_perturbation(perturbation.as_ref());
+        environment.set_session(SESSION);
         environment.reset(seed)?;
         Ok(Self {
             environment,
@@ -284,6 +288,9 @@ impl SimulatedCell {
     /// Takes over what may change while the node is active.
     pub fn set_hardware(&mut self, hardware: &HardwareSettings) {
         let tool_voltage = self.hardware.tool_voltage;
+        if hardware.speed_scaling != self.hardware.speed_scaling {
+            self.slide(hardware.speed_scaling / self.hardware.speed_scaling);
+        }
         self.hardware = HardwareSettings {
             // Set by the robot's program, too.
             tool_voltage,
@@ -294,11 +301,6 @@ impl SimulatedCell {
     /// The simulation.
     pub fn environment(&self) -> &Environment {
         &self.environment
-    }
-
-    /// The simulation.
-    pub fn environment_mut(&mut self) -> &mut Environment {
-        &mut self.environment
     }
 
     /// Simulated time, over all episodes.
@@ -326,14 +328,18 @@ impl SimulatedCell {
         until_contact: bool,
         tolerances_rad: &Joints,
     ) -> Result<(), BeginError> {
-        let servo = Servo::new(self.hardware.servo_delay_s, self.hardware.speed_scaling);
-        let actual = servo.actual(&trajectory)?;
+        let desired = Servo::new(0.0, self.hardware.speed_scaling).actual(&trajectory)?;
+        // At the speed that the slider allows it lags as at any other.
+        let servo = Servo::new(self.hardware.servo_delay_s, 1.0);
+        let actual = servo.actual(&desired)?;
         let braking = self.hardware.braking_time_s > 0.0;
-        let followed = (braking || !servo.is_ideal()).then(|| Followed {
+        let is_ideal = servo.is_ideal() && self.hardware.speed_scaling == 1.0;
+        let followed = (braking || !is_ideal).then(|| Followed {
             servo,
-            desired: trajectory,
+            desired,
             actual: actual.clone(),
             tolerances_rad: *tolerances_rad,
+            until_contact,
             begin: self.time(),
         });
         self.environment.cell_mut().begin(actual, until_contact)?;
@@ -393,6 +399,38 @@ impl SimulatedCell {
         passed
     }
 
+    /// The speed slider was moved: what is left of the motion under way goes on at so much of its present speed. The arm lags by as much of its
+    /// way as before.
+    fn slide(&mut self, factor: f64) {
+        let Some(followed) = &self.followed else {
+            return;
+        };
+        let elapsed = self.time() - followed.begin;
+        // Later the arm only waits.
+        if !self.is_moving() || elapsed >= followed.actual.duration() {
+            return;
+        }
+        let slid = |of: &JointTrajectory| Servo::slide(of, elapsed, factor);
+        // One that would take too long keeps its speed.
+        let (Ok(desired), Ok(actual)) = (slid(&followed.desired), slid(&followed.actual)) else {
+            return;
+        };
+        let (tolerances_rad, servo) = (followed.tolerances_rad, followed.servo);
+        let until_contact = followed.until_contact;
+        let cell = self.environment.cell_mut();
+        cell.cancel();
+        // It begins where the arm is.
+        let begun = cell.begin(actual.clone(), until_contact);
+        self.followed = begun.is_ok().then(|| Followed {
+            servo,
+            desired,
+            actual,
+            tolerances_rad,
+            until_contact,
+            begin: self.time(),
+        });
+    }
+
     /// Stops the motion under way. An arm without inertia stands still at once; another one brakes: `step` goes on until it ends.
     pub fn cancel(&mut self) {
         let was_moving = self.environment.cell_mut().cancel();
@@ -446,6 +484,9 @@ impl SimulatedCell {
             return;
         }
         let suction = self.valve && self.has_power(self.wiring.suction_pin);
+        let blow_off = u8::try_from(self.hardware.blow_off_pin).is_ok_and(|pin| {
+            self.has_power(pin) && self.outputs.get(&pin).is_some_and(|level| *level)
+        });
         self.leaked &= suction;
         let cell = self.environment.cell_mut();
         if suction && !self.leaked && !cell.is_holding() && (moving || !cell.suction()) {
@@ -454,7 +495,8 @@ impl SimulatedCell {
             cell.set_suction(true);
         }
         let closed = cell.is_holding();
-        let stays = self.vacuum.update(&self.hardware, now, suction, closed);
+        let valves = Valves { suction, blow_off };
+        let stays = self.vacuum.update(&self.hardware, now, valves, closed);
         if closed && !stays {
             cell.set_suction(false);
             self.leaked = suction;
@@ -514,7 +556,11 @@ impl SimulatedCell {
             true => cell.is_holding(),
             false => self.vacuum.senses() && self.has_power(vacuum_pin),
         };
-        let inputs = (0..PINS).map(|pin| (pin, pin == vacuum_pin && senses));
+        let enable_pin = u8::try_from(self.hardware.enable_pin).ok();
+        let inputs = (0..PINS).map(|pin| {
+            let enabled = Some(pin) == enable_pin && self.hardware.enabled;
+            (pin, enabled || pin == vacuum_pin && senses)
+        });
         let mut outputs = self.outputs.clone();
         outputs.insert(suction_pin, self.valve);
         Pins {
@@ -633,6 +679,40 @@ mod tests {
         // From here the same trajectory would jump.
         let failure = cell.begin(trajectory, false, &any()).unwrap_err();
         assert!(failure.to_string().contains("starts at"), "{failure}");
+    }
+
+    #[test]
+    fn the_speed_slider_counts_in_the_middle_of_a_motion() {
+        let (mut cell, work_cell) = cell();
+        let mut hardware = HardwareSettings {
+            servo_delay_s: 0.03,
+            braking_time_s: 0.1,
+            ..HardwareSettings::default()
+        };
+        cell.set_hardware(&hardware);
+        let trajectory = turn(&work_cell);
+        let start = cell.time();
+        cell.begin(trajectory.clone(), false, &Joints::repeat(0.05))
+            .unwrap();
+        while cell.time() - start < Duration::from_millis(500) {
+            assert_eq!(cell.step(NOW), Step::Moving);
+        }
+        let before_rad = cell.joints_rad()[0];
+        hardware.speed_scaling = 0.25;
+        cell.set_hardware(&hardware);
+        // It goes on from where it is.
+        assert_eq!(cell.step(NOW), Step::Moving);
+        assert!((cell.joints_rad()[0] - before_rad).abs() < 1e-3);
+        let ended = loop {
+            match cell.step(NOW) {
+                Step::Moving => {}
+                ended => break ended,
+            }
+        };
+        assert_eq!(ended, Step::Ended(MotionEnd::Reached));
+        assert!((cell.joints_rad() - trajectory.last().positions_rad).amax() < 1e-6);
+        // Half a second of way was left, at a quarter of the speed.
+        assert!(cell.time() - start > Duration::from_millis(2200));
     }
 
     #[test]

@@ -12,7 +12,10 @@ use nalgebra::SVector;
 use pick_place::{PickPlace, PrimitiveSettings};
 
 use crate::mutation::{Mutation, planted};
-use crate::{OperatorDecision, Proposal, ProposalId, ProposalStatus, StepOutcome};
+use crate::{
+    MotionCause, Obstacle, OperatorDecision, Proposal, ProposalId, ProposalStatus, RefusalReason,
+    StepOutcome,
+};
 
 /// Heightmaps kept, by stamp, until the proposals that were made from them arrive.
 const HEIGHTMAPS: usize = 64;
@@ -22,13 +25,15 @@ const PROPOSALS: usize = 1024;
 const INVALID: usize = 64;
 /// Confirmations that wait for their proposal; more are refused at once.
 const WAITING: usize = 16;
+/// How long an approval waits until its motion has been rehearsed: less than a second, unless the machine is overloaded.
+pub(crate) const REHEARSAL_GRACE: Duration = Duration::from_secs(5);
 
 /// Which proposals move only when somebody approves them.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum RequireApproval {
     /// Every one.
     Always,
-    /// Those without a probability of success of at least `threshold`.
+    /// Those without a probability of success of at least `threshold`, and those whose goal looks reached already.
     Unsure {
         /// From 0 to 1.
         threshold: f32,
@@ -38,14 +43,53 @@ pub enum RequireApproval {
 }
 
 impl RequireApproval {
-    fn of(&self, proposal: &Proposal) -> bool {
+    /// Whether this proposal needs an approval, as long as nothing was stopped.
+    fn asks_for(&self, proposal: &Proposal) -> bool {
         match self {
             Self::Always => true,
-            Self::Unsure { threshold } => !proposal
-                .success_probability
-                .is_some_and(|probability| probability >= *threshold),
+            Self::Unsure { threshold } => {
+                let success = proposal.success_probability;
+                let is_sure = success.is_some_and(|success| success >= *threshold);
+                !is_sure || proposal.verdict() == crate::Verdict::Done
+            }
             Self::Never => false,
         }
+    }
+}
+
+/// Whether the executor carries proposals out by itself: as the rule says, and from a stop or a fault on not before the next
+/// approval.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Unasked {
+    is_on: bool,
+}
+
+impl Unasked {
+    /// Nothing was stopped.
+    pub fn new(rule: RequireApproval) -> Self {
+        Self {
+            is_on: rule != RequireApproval::Always,
+        }
+    }
+
+    /// A stop or a fault has come: nothing goes on by itself.
+    pub fn stop(&mut self) {
+        self.is_on = false;
+    }
+
+    /// An operator has approved a proposal, and it moves: things go on.
+    pub fn go_on(&mut self, rule: RequireApproval) {
+        *self = Self::new(rule);
+    }
+
+    /// Whether some proposals are carried out unasked.
+    pub fn is_on(&self) -> bool {
+        self.is_on
+    }
+
+    /// Whether this one is.
+    pub fn moves(&self, rule: RequireApproval, proposal: &Proposal) -> bool {
+        self.is_on && !rule.asks_for(proposal)
     }
 }
 
@@ -62,6 +106,8 @@ pub struct GateRules {
     pub confirmation_grace: Duration,
     /// Which proposals move only when somebody approves them.
     pub require_approval: RequireApproval,
+    /// Names of those whose approvals and rejections count; empty where everybody's do.
+    pub operators: Vec<String>,
 }
 
 /// What has become of the cells of a change.
@@ -145,6 +191,18 @@ pub enum InvalidProposal {
 /// Why a confirmation moves nothing.
 #[derive(Clone, Debug, PartialEq, thiserror::Error)]
 pub enum Refusal {
+    /// Somebody has said it who does not decide.
+    #[error(
+        "proposal {id}: `{name}` does not decide here, expected one of {operators:?} (parameter operators)"
+    )]
+    NotAnOperator {
+        /// The proposal.
+        id: ProposalId,
+        /// Who has said it.
+        name: String,
+        /// Who decides.
+        operators: Vec<String>,
+    },
     /// No such proposal has arrived.
     #[error("proposal {id} is unknown")]
     Unknown {
@@ -182,19 +240,21 @@ pub enum Refusal {
         /// The proposal.
         id: ProposalId,
     },
-    /// The arm is not where the way home begins.
-    #[error("proposal {id}: the arm has moved since its way home was proposed: call for it again")]
+    /// The arm is not where the way home begins, or something else is held or seen.
+    #[error(
+        "proposal {id}: the arm has moved since its way home was proposed, or what is held or seen has changed: call for it again"
+    )]
     HomeFromElsewhere {
         /// The proposal.
         id: ProposalId,
     },
-    /// The robot cannot move now, or not so.
-    #[error("proposal {id}: {reason}")]
+    /// The robot is not ready, or the proposed motion is not feasible.
+    #[error("proposal {id}: {obstacle}")]
     Robot {
         /// The proposal.
         id: ProposalId,
-        /// Why.
-        reason: String,
+        /// The reason.
+        obstacle: Obstacle,
     },
     /// Made from what was seen before the last motion ended.
     #[error(
@@ -249,6 +309,15 @@ pub enum Refusal {
         /// Where and how much.
         change: Change,
     },
+    /// Its motion was not rehearsed from where the arm is, on what is seen.
+    #[error(
+        "proposal {id}: its motion has not been checked for collisions within {:?}",
+        REHEARSAL_GRACE
+    )]
+    NotRehearsed {
+        /// The proposal.
+        id: ProposalId,
+    },
     /// It waited for its proposal when a stop came.
     #[error("proposal {id}: a stop came before it")]
     StopCame {
@@ -261,6 +330,41 @@ pub enum Refusal {
         /// The proposal named.
         id: ProposalId,
     },
+}
+
+impl InvalidProposal {
+    fn reason(&self) -> RefusalReason {
+        match self {
+            Self::OutsideWorkspace { .. } => RefusalReason::OutsideWorkspace,
+            Self::Message(_)
+            | Self::Frame { .. }
+            | Self::NotFinite { .. }
+            | Self::Settings { .. }
+            | Self::DifferentContents { .. } => RefusalReason::InvalidProposal,
+        }
+    }
+}
+
+impl Refusal {
+    /// What a person can do something about; its words are in the text.
+    pub fn reason(&self) -> RefusalReason {
+        match self {
+            Self::Unknown { .. } | Self::NothingToStop { .. } => RefusalReason::Unknown,
+            Self::Invalid(invalid) => invalid.reason(),
+            Self::NotPending { .. } => RefusalReason::NotPending,
+            Self::NotAnOperator { .. } => RefusalReason::NotAnOperator,
+            Self::Busy { .. } => RefusalReason::Busy,
+            Self::Homing { .. } => RefusalReason::OnItsWayHome,
+            Self::HomeFromElsewhere { .. } => RefusalReason::HomeFromElsewhere,
+            Self::Robot { obstacle, .. } => obstacle.reason(),
+            Self::OldObservation { .. } => RefusalReason::OldObservation,
+            Self::NoSourceHeightmap { .. } => RefusalReason::NoSourceHeightmap,
+            Self::OtherWorkspace { .. } => RefusalReason::OtherWorkspace,
+            Self::ObservationChanged { .. } => RefusalReason::ObservationChanged,
+            Self::NotRehearsed { .. } => RefusalReason::NotRehearsed,
+            Self::StopCame { .. } | Self::MotionBrokenOff { .. } => RefusalReason::Stopped,
+        }
+    }
 }
 
 /// What became of a proposal that arrived.
@@ -294,6 +398,8 @@ pub enum GateAction {
     Move(Box<Proposal>),
     /// Bring the arm home, by this proposal; [`ApprovalGate::finish`] has to follow.
     GoHome(ProposalId),
+    /// Put down what is held and bring the arm home, by this proposal; [`ApprovalGate::finish`] has to follow.
+    PutDown(ProposalId),
     /// Stop the motion under way.
     Cancel,
     /// Say this.
@@ -303,31 +409,53 @@ pub enum GateAction {
 /// What the gate asks about the robot, at the moment of an approval.
 pub trait RobotState {
     /// Why the arm must not move now, if there is a reason.
-    fn obstacle(&self) -> Option<String>;
+    fn obstacle(&self) -> Option<Obstacle>;
 
-    /// Plans the whole motion from where the arm is.
+    /// Whether the whole motion can begin: it was rehearsed from where the arm is, on what is seen. Answers at once: a stop may be waiting.
     ///
     /// # Errors
-    /// Says what cannot be planned.
-    fn plan(&self, proposal: &Proposal) -> Result<(), String>;
+    /// Says what cannot be planned, or what would be hit; or that the motion has not been rehearsed.
+    fn check_motion(&self, proposal: &Proposal) -> Result<(), CannotBegin>;
 
-    /// Plans the way home from where the arm is. Returns where that is (rad).
+    /// The same for what brings the arm home. Returns where the arm is (rad).
     ///
     /// # Errors
-    /// Says what cannot be planned, or what would be hit.
-    fn plan_home(&self) -> Result<JointPositions, String>;
+    /// Says what cannot be planned, or what would be hit; or that the motion has not been rehearsed.
+    fn check_recovery(&self, recovery: Recovery) -> Result<JointPositions, CannotBegin>;
+}
+
+/// Why a motion cannot begin.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum CannotBegin {
+    /// For this reason.
+    Refused(Obstacle),
+    /// It was not rehearsed, or from elsewhere or on another view.
+    NotRehearsed,
+}
+
+/// The executor plans a recovery, checks it for collisions and proposes it in this time.
+pub const RECOVERY_TIMEOUT: Duration = Duration::from_secs(60);
+
+/// What brings the arm home after a stop or a fault.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Recovery {
+    /// The way home; what is held stays held.
+    Home,
+    /// What is held is put down first.
+    PutDown,
 }
 
 /// Positions of the arm's joints (rad).
 pub type JointPositions = SVector<f64, 6>;
 
 /// The arm is where it was when no joint is further from there (rad): encoders have noise.
-const AT_REST_RAD: f64 = 1e-3;
+pub const AT_REST_RAD: f64 = 1e-3;
 
 /// A way home that can be approved.
 #[derive(Clone, Copy, Debug)]
 struct Home {
     id: ProposalId,
+    recovery: Recovery,
     /// Where it begins.
     from_rad: JointPositions,
 }
@@ -357,6 +485,7 @@ struct Newest {
 struct Waiting {
     id: ProposalId,
     decision: OperatorDecision,
+    since: Duration,
     until: Duration,
 }
 
@@ -382,7 +511,7 @@ pub struct ApprovalGate {
     /// Heightmaps from before the end of the last motion are no ground to move on.
     moved_until: Option<Duration>,
     /// Whether new proposals move by themselves.
-    automatic: bool,
+    unasked: Unasked,
 }
 
 impl ApprovalGate {
@@ -399,19 +528,14 @@ impl ApprovalGate {
             home: None,
             homing: None,
             moved_until: None,
-            automatic: rules.require_approval != RequireApproval::Always,
+            unasked: Unasked::new(rules.require_approval),
             rules,
         }
     }
 
-    /// From the next confirmation on.
-    pub fn set_rules(&mut self, rules: GateRules) {
-        self.rules = rules;
-    }
-
     /// Nothing moves by itself before the next approval: a stop or fault came before this gate was made.
     pub fn remember_stop(&mut self) {
-        self.automatic = false;
+        self.unasked.stop();
     }
 
     /// The proposal that is being carried out.
@@ -422,7 +546,7 @@ impl ApprovalGate {
     /// Whether the executor approves some new proposals itself: approval is not always required, and no stop or fault has come
     /// since the last approval.
     pub fn is_automatic(&self) -> bool {
-        self.automatic
+        self.unasked.is_on()
     }
 
     /// Whether the executor approves this proposal itself: it is the newest one, and the rules do not ask for an approval of it. A way
@@ -432,12 +556,12 @@ impl ApprovalGate {
             if planted(Mutation::HomeMovesUnasked) {
                 return true;
             }
-            return self.automatic && self.rules.require_approval == RequireApproval::Never;
+            return self.unasked.is_on() && self.rules.require_approval == RequireApproval::Never;
         }
         let newest = self.newest.as_ref();
         let newest = newest.filter(|newest| newest.proposal.id == id);
-        self.automatic
-            && newest.is_some_and(|newest| !self.rules.require_approval.of(&newest.proposal))
+        let rule = self.rules.require_approval;
+        newest.is_some_and(|newest| self.unasked.moves(rule, &newest.proposal))
     }
 
     /// Takes the newest observation.
@@ -544,6 +668,29 @@ impl ApprovalGate {
         }
     }
 
+    /// Checks that somebody's decision on a proposal counts: where the rules name operators, approvals and rejections of these alone. A stop is
+    /// taken from everybody. To be asked before [`Self::on_confirmation`]; names are no authentication.
+    ///
+    /// # Errors
+    /// The name is none of the operators'.
+    pub fn check_operator(
+        &self,
+        id: ProposalId,
+        decision: OperatorDecision,
+        name: &str,
+    ) -> Result<(), Refusal> {
+        let operators = &self.rules.operators;
+        let decides = operators.is_empty() || operators.iter().any(|operator| operator == name);
+        if decides || decision == OperatorDecision::Stop {
+            return Ok(());
+        }
+        Err(Refusal::NotAnOperator {
+            id,
+            name: name.to_owned(),
+            operators: operators.clone(),
+        })
+    }
+
     /// Takes a confirmation. Decisions that speak of a motion that was carried out are for the goal tracker.
     pub fn on_confirmation(
         &mut self,
@@ -552,7 +699,7 @@ impl ApprovalGate {
         robot: &impl RobotState,
         now: Duration,
     ) -> Vec<GateAction> {
-        self.confirm(id, decision, robot, now, None)
+        self.confirm(id, decision, robot, now, now)
     }
 
     /// Answers the confirmations that wait, where what they wait for has arrived or their time is up.
@@ -562,9 +709,10 @@ impl ApprovalGate {
             let Waiting {
                 id,
                 decision,
-                until,
+                since,
+                ..
             } = waiting;
-            self.confirm(id, decision, robot, now, Some(until))
+            self.confirm(id, decision, robot, now, since)
         };
         waiting.into_iter().flat_map(again).collect()
     }
@@ -574,19 +722,19 @@ impl ApprovalGate {
         self.waiting.iter().map(|waiting| waiting.until).min()
     }
 
-    /// `until`: how long it may wait, where it has waited already.
+    /// `since`: when it arrived.
     fn confirm(
         &mut self,
         id: ProposalId,
         decision: OperatorDecision,
         robot: &impl RobotState,
         now: Duration,
-        until: Option<Duration>,
+        since: Duration,
     ) -> Vec<GateAction> {
         let mut actions = Vec::new();
         if decision == OperatorDecision::Stop {
             // Nothing goes on by itself after a stop.
-            self.automatic = false;
+            self.unasked.stop();
             if !planted(Mutation::WaitingSurvivesStop) {
                 actions.extend(self.refuse_waiting(|id| Refusal::StopCame { id }));
             }
@@ -604,13 +752,18 @@ impl ApprovalGate {
             Verdict::Report(outcome, reason) => actions.push(self.report(id, outcome, reason)),
             Verdict::Refuse(refusal) => actions.push(self.refuse(id, &refusal)),
             Verdict::Wait(refusal) => {
-                let until = until.unwrap_or(now + self.rules.confirmation_grace);
+                let grace = match refusal {
+                    Refusal::NotRehearsed { .. } => REHEARSAL_GRACE,
+                    _ => self.rules.confirmation_grace,
+                };
+                let until = since + grace;
                 if now >= until || self.waiting.len() >= WAITING {
                     actions.push(self.refuse(id, &refusal));
                 } else {
                     self.waiting.push_back(Waiting {
                         id,
                         decision,
+                        since,
                         until,
                     });
                 }
@@ -671,6 +824,13 @@ impl ApprovalGate {
         }
     }
 
+    /// The proposal that can be approved, the way home apart.
+    pub fn pending(&self) -> Option<&Proposal> {
+        let newest = self.newest.as_ref()?;
+        let id = newest.proposal.id;
+        self.check_pending(id).ok().map(|()| &newest.proposal)
+    }
+
     /// Takes a proposal back that nobody has approved yet.
     pub fn withdraw(&mut self, id: ProposalId) {
         if self.status(id) == Some(ProposalStatus::Pending) {
@@ -678,37 +838,47 @@ impl ApprovalGate {
         }
     }
 
-    /// Proposes the way home from where the arm is; `id` is for a new proposal. Returns the id of the one that can be approved now: the
-    /// one before where the arm has not moved since.
+    /// Proposes the way home from where the arm is, maybe after what is held is put down; `id` is for a new proposal. Returns the id of the one
+    /// that can be approved now: the one before where the arm has not moved since.
     ///
     /// # Errors
-    /// Says why there is no way home now.
+    /// Says why there is no way home now, or that it has to be rehearsed first.
     pub fn propose_home(
         &mut self,
         id: ProposalId,
+        recovery: Recovery,
         robot: &impl RobotState,
-    ) -> Result<ProposalId, String> {
+    ) -> Result<ProposalId, CannotBegin> {
+        let refuse = |obstacle| Err(CannotBegin::Refused(obstacle));
         if let Some(id) = self.moving {
-            return Err(format!("proposal {id} is being carried out"));
+            let busy = MotionCause::Proposal(id).busy_text();
+            return refuse(RefusalReason::Busy.because(busy));
         }
-        if self.homing.is_some() {
-            return Err("the arm is on its way home".to_owned());
+        if let Some(id) = self.homing {
+            let busy = MotionCause::Home(id).busy_text();
+            return refuse(RefusalReason::OnItsWayHome.because(busy));
         }
         if let Some(obstacle) = robot.obstacle() {
-            return Err(obstacle);
+            return refuse(obstacle);
         }
-        let from_rad = robot.plan_home()?;
+        let from_rad = robot.check_recovery(recovery)?;
         if let Some(home) = &self.home
+            && home.recovery == recovery
             && home.is_from(&from_rad)
         {
             return Ok(home.id);
         }
         if self.status(id).is_some() {
-            return Err(format!("proposal {id} is another one"));
+            let text = format!("the id {id} is that of another proposal");
+            return refuse(RefusalReason::Other.because(text));
         }
         self.close_home(ProposalStatus::Superseded);
         self.remember(id);
-        self.home = Some(Home { id, from_rad });
+        self.home = Some(Home {
+            id,
+            recovery,
+            from_rad,
+        });
         Ok(id)
     }
 
@@ -733,7 +903,7 @@ impl ApprovalGate {
         if !broken_off {
             return Vec::new();
         }
-        self.automatic = false;
+        self.unasked.stop();
         self.refuse_waiting(|id| Refusal::MotionBrokenOff { id })
     }
 
@@ -784,8 +954,8 @@ impl ApprovalGate {
             return Verdict::Refuse(reason.clone().into());
         }
         let proposal = &newest.proposal;
-        if let Some(reason) = robot.obstacle() {
-            return Verdict::Refuse(Refusal::Robot { id, reason });
+        if let Some(obstacle) = robot.obstacle() {
+            return Verdict::Refuse(Refusal::Robot { id, obstacle });
         }
         if let Some(moved_until) = self.moved_until
             && proposal.stamp < moved_until
@@ -799,8 +969,15 @@ impl ApprovalGate {
         if let Err(verdict) = self.check_unchanged(newest) {
             return verdict;
         }
-        if let Err(reason) = robot.plan(proposal) {
-            return Verdict::Refuse(Refusal::Robot { id, reason });
+        match robot.check_motion(proposal) {
+            Ok(()) => {}
+            Err(CannotBegin::Refused(obstacle)) => {
+                return Verdict::Refuse(Refusal::Robot { id, obstacle });
+            }
+            Err(CannotBegin::NotRehearsed) if planted(Mutation::MovesUnrehearsed) => {}
+            Err(CannotBegin::NotRehearsed) => {
+                return Verdict::Wait(Refusal::NotRehearsed { id });
+            }
         }
         let proposal = Box::new(proposal.clone());
         if !planted(Mutation::HomeSurvivesMotion) {
@@ -809,28 +986,33 @@ impl ApprovalGate {
         self.set_status(id, ProposalStatus::Moving);
         self.moving = Some(id);
         // After a stop or a fault an approval lets things go on.
-        self.automatic = self.rules.require_approval != RequireApproval::Always;
+        self.unasked.go_on(self.rules.require_approval);
         Verdict::Act(GateAction::Move(proposal))
     }
 
     /// Approves a way home. It lets nothing else go on after a stop or a fault.
     fn approve_home(&mut self, home: Home, robot: &impl RobotState) -> Verdict {
         let id = home.id;
-        if let Some(reason) = robot.obstacle() {
-            return Verdict::Refuse(Refusal::Robot { id, reason });
+        if let Some(obstacle) = robot.obstacle() {
+            return Verdict::Refuse(Refusal::Robot { id, obstacle });
         }
-        match robot.plan_home() {
+        match robot.check_recovery(home.recovery) {
             Ok(from_rad) if home.is_from(&from_rad) => {}
-            Ok(_) => {
+            Ok(_) | Err(CannotBegin::NotRehearsed) => {
                 self.close_home(ProposalStatus::Withdrawn);
                 return Verdict::Refuse(Refusal::HomeFromElsewhere { id });
             }
-            Err(reason) => return Verdict::Refuse(Refusal::Robot { id, reason }),
+            Err(CannotBegin::Refused(obstacle)) => {
+                return Verdict::Refuse(Refusal::Robot { id, obstacle });
+            }
         }
         self.home = None;
         self.set_status(id, ProposalStatus::Moving);
         self.homing = Some(id);
-        Verdict::Act(GateAction::GoHome(id))
+        Verdict::Act(match home.recovery {
+            Recovery::Home => GateAction::GoHome(id),
+            Recovery::PutDown => GateAction::PutDown(id),
+        })
     }
 
     fn reject(&mut self, id: ProposalId) -> Verdict {

@@ -25,7 +25,7 @@ pub struct ShownStep {
 /// The goals of a demonstration, or of a sequence that somebody taught.
 #[derive(Clone, Debug, Default, PartialEq)]
 pub struct GoalSequence {
-    /// The workspace before the first step, v_0; none where nobody saw it.
+    /// The workspace before the first step, v_0; `None` where nobody saw it.
     pub start: Option<Arc<Heightmap>>,
     /// v_1 to v_D, in order.
     pub goals: Vec<Goal>,

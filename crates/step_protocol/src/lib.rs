@@ -6,9 +6,12 @@
 
 mod gate;
 mod goals;
+mod motion;
 mod mutation;
 mod operator;
 mod planner;
+mod presence;
+mod reason;
 mod tracker;
 mod types;
 
@@ -16,20 +19,23 @@ mod types;
 mod tests;
 
 pub use gate::{
-    ApprovalGate, GateAction, GateRules, InvalidProposal, JointPositions, Proposed, Refusal,
-    Report, RequireApproval, RobotState,
+    AT_REST_RAD, ApprovalGate, CannotBegin, GateAction, GateRules, InvalidProposal, JointPositions,
+    Proposed, RECOVERY_TIMEOUT, Recovery, Refusal, Report, RequireApproval, RobotState, Unasked,
 };
 pub use goals::{
     FAILED_PICK_RADIUS_M, FailedPicks, GoalSequence, Judgement, NoGoals, ReachedGoals, ShownStep,
     goal_steps, goals_of,
 };
-pub use operator::{Operator, Question};
+pub use motion::{MotionCause, MotionEnd, MotionWord, StopCause};
+pub use operator::{Operator, Question, RunPhase};
 pub use planner::{Job, PlannerRules, Prediction, ProposalPlanner};
+pub use presence::{PRESENCE_PERIOD, Presence};
+pub use reason::{Obstacle, RefusalReason};
 pub use tracker::{
     Capture, CaptureError, Change, ConfirmationRefusal, GoalTracker, NoSuchStep, RefusalKind,
     StepJudge,
 };
 pub use types::{
     Confirmation, Coverage, Goal, Observation, OperatorDecision, Proposal, ProposalId,
-    ProposalStatus, Reward, StepOutcome, StepResult, yaw_rad,
+    ProposalStatus, Reward, StepOutcome, StepResult, Verdict, yaw_rad,
 };

@@ -15,6 +15,8 @@ pub(crate) enum Mutation {
     AnyApprovalMovesNewest,
     /// An approval while the arm moves is accepted.
     MovesWhileMoving,
+    /// A motion begins that was not rehearsed.
+    MovesUnrehearsed,
     /// A call for the way home moves the arm.
     HomeMovesUnasked,
     /// The proposed way home can still be approved after a stop.
@@ -35,18 +37,25 @@ pub(crate) enum Mutation {
     SilenceForgetsMotion,
     /// A refused proposal is never made anew.
     RefusedIsNotRenewed,
+    /// A page does not ask again where a decision was not answered.
+    UnansweredIsForgotten,
+    /// A page shows a run as stopped after it was continued.
+    ContinuedStaysStopped,
+    /// A proposal for another goal hides that for the present one from the page.
+    OtherGoalHidesProposal,
 }
 
 impl Mutation {
     /// All of them.
     #[cfg(test)]
-    pub(crate) const ALL: [Self; 16] = [
+    pub(crate) const ALL: [Self; 20] = [
         Self::ApprovalMovesTwice,
         Self::SupersededStaysPending,
         Self::WaitingSurvivesStop,
         Self::WaitingSurvivesDeactivation,
         Self::AnyApprovalMovesNewest,
         Self::MovesWhileMoving,
+        Self::MovesUnrehearsed,
         Self::HomeMovesUnasked,
         Self::HomeSurvivesStop,
         Self::HomeSurvivesMotion,
@@ -57,6 +66,9 @@ impl Mutation {
         Self::RefusalReopensMoving,
         Self::SilenceForgetsMotion,
         Self::RefusedIsNotRenewed,
+        Self::UnansweredIsForgotten,
+        Self::ContinuedStaysStopped,
+        Self::OtherGoalHidesProposal,
     ];
 }
 

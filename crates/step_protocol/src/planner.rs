@@ -39,6 +39,8 @@ pub struct Prediction {
     pub place_score: f32,
     /// Probability that the step succeeds, where something estimates it.
     pub success_probability: Option<f32>,
+    /// Probability that the goal is reached already, where something estimates it.
+    pub done_probability: Option<f32>,
 }
 
 /// How a planner proposes.
@@ -452,6 +454,7 @@ fn propose(
         success_probability: prediction.success_probability,
         checkpoint: rules.checkpoint.clone(),
         author: rules.author.clone(),
+        done_probability: prediction.done_probability,
     }
 }
 

@@ -278,15 +278,49 @@ pub struct Proposal {
     pub pick_score: f32,
     /// Probability of the place cell and rotation, 0 to 1.
     pub place_score: f32,
-    /// Probability that the step succeeds, 0 to 1; none where nothing estimates it.
+    /// Probability that the step succeeds, 0 to 1; `None` where nothing estimates it.
     pub success_probability: Option<f32>,
     /// Name of the checkpoint that made it; empty where a person did.
     pub checkpoint: String,
     /// Who made it: a node or a person.
     pub author: String,
+    /// Probability that the goal is reached already, 0 to 1; `None` where nothing estimates it.
+    pub done_probability: Option<f32>,
+}
+
+/// What a proposal's estimates say of it.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Verdict {
+    /// It is worth carrying out, as far as anything estimates it.
+    Act,
+    /// The goal is probably reached already: there is nothing to do.
+    Done,
+    /// It fails more probably than it succeeds: the policy does not know what to do.
+    Unknown,
+}
+
+impl Verdict {
+    /// What to tell the operator; empty for [`Verdict::Act`].
+    pub const fn text(self) -> &'static str {
+        match self {
+            Self::Act => "",
+            Self::Done => "the goal of this step looks reached already",
+            Self::Unknown => "the policy does not know how to reach the goal",
+        }
+    }
 }
 
 impl Proposal {
+    /// The verdict of its estimates.
+    pub fn verdict(&self) -> Verdict {
+        let estimates = (self.done_probability, self.success_probability);
+        match estimates {
+            (Some(done), _) if done > 0.5 => Verdict::Done,
+            (_, Some(success)) if success < 0.5 => Verdict::Unknown,
+            _ => Verdict::Act,
+        }
+    }
+
     /// Whether two messages ask for the same motion for the same goal.
     pub fn is_same_motion(&self, other: &Self) -> bool {
         let goal = |proposal: &Self| (proposal.step, proposal.attempt, proposal.stamp);
@@ -345,7 +379,7 @@ pub struct Confirmation {
 /// What the simulator measured at rest.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Reward {
-    /// When.
+    /// Time of the measurement [ROS time].
     pub stamp: Duration,
     /// Change since the one before.
     pub delta: f64,

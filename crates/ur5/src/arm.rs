@@ -222,7 +222,7 @@ const REFINEMENTS: usize = 40;
 
 impl Arm {
     /// Joint acceleration of planned motions where nothing else is set: above what the fastest transfers of the demonstrations need (22
-    /// rad/s^2), so that they stay as recorded. A real arm should get less, see [`Self::set_motion_limits`].
+    /// rad/s^2), so that they stay as recorded. A real arm gets less, by [`Self::set_motion_limits`]: `config/real_cell.yaml`.
     pub const DEFAULT_ACCELERATION_RAD_S2: f64 = 25.0;
     /// Joint jerk of planned motions where nothing else is set.
     pub const DEFAULT_JERK_RAD_S3: f64 = 800.0;

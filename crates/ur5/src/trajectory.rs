@@ -508,12 +508,17 @@ fn stretch_for_acceleration(arm: &Arm, total_s: f64, path: &[(Joints, Joints)]) 
 }
 
 fn check_start(arm: &Arm, joints: &Joints) -> Result<(), PlanError> {
-    if arm.within_limits(joints) {
+    let (lower, upper) = &arm.limits_rad;
+    // Not a number fails both comparisons.
+    let within = |joint: &usize| joints[*joint] >= lower[*joint] && joints[*joint] <= upper[*joint];
+    let Some(joint) = (0..6).find(|joint| !within(joint)) else {
         return Ok(());
-    }
-    let joints: Vec<f64> = joints.iter().copied().collect();
+    };
     Err(PlanError::Invalid(format!(
-        "joints {joints:?} are beyond the arm's limits"
+        "joint {joint} of {} is beyond the arm's limits, expected {:.4} to {:.4} rad",
+        joints_text(joints),
+        lower[joint],
+        upper[joint]
     )))
 }
 

@@ -181,6 +181,28 @@ impl WorkCell {
         Self::parse(&text, &name)
     }
 
+    /// As [`Self::load`]; [`Self::builtin`] where the path is empty.
+    ///
+    /// # Errors
+    /// As [`Self::load`].
+    pub fn load_or_builtin(path: &Path) -> Result<Self, WorkCellError> {
+        if path.as_os_str().is_empty() {
+            return Self::builtin();
+        }
+        Self::load(path)
+    }
+
+    /// As [`Self::with_calibration`], from a file; the same cell where the path is empty.
+    ///
+    /// # Errors
+    /// As [`ArmCalibration::load`] and [`Self::with_calibration`].
+    pub fn with_calibration_file(self, path: &Path) -> Result<Self, WorkCellError> {
+        if path.as_os_str().is_empty() {
+            return Ok(self);
+        }
+        self.with_calibration(&ArmCalibration::load(path)?)
+    }
+
     /// The same cell with the arm's joints where its factory calibration says.
     ///
     /// # Errors

@@ -371,6 +371,27 @@ fn what_is_wrong_with_a_urdf_is_named() {
 }
 
 #[test]
+fn an_arm_of_seven_joints_is_refused_with_their_names() {
+    let text = std::fs::read_to_string(URDF).unwrap();
+    // A joint more, between the flange and the tool.
+    let fixed = r#"<joint name="tool0-suction_gripper" type="fixed">"#;
+    assert!(text.contains(fixed));
+    let seventh = r#"<joint name="wrist_4_joint" type="revolute"><axis xyz="0 0 1"/>
+        <limit lower="-3" upper="3" effort="28" velocity="3"/>"#;
+    let error = WorkCell::parse(&text.replace(fixed, seventh), "arm_of_seven.urdf")
+        .unwrap_err()
+        .to_string();
+    for expected in [
+        "arm_of_seven.urdf: ",
+        "expected six moving joints",
+        "shoulder_pan_joint",
+        "wrist_4_joint",
+    ] {
+        assert!(error.contains(expected), "{error}");
+    }
+}
+
+#[test]
 fn meshes_are_left_out_with_one_warning_and_a_missing_colour_is_grey() {
     let text = std::fs::read_to_string(URDF).unwrap();
     let plain = cell();

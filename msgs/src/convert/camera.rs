@@ -217,58 +217,14 @@ pub fn depth_to_msg_mm(
     )
 }
 
-/// Lens models of drivers that project like a pinhole where all coefficients are 0; librealsense's names besides ROS's own. A fisheye
-/// model (`equidistant`) is no pinhole even then.
-const PINHOLE_MODELS: [&str; 8] = [
-    "",
-    "none",
-    "plumb_bob",
-    "rational_polynomial",
-    "thin_prism",
-    "brown_conrady",
-    "inverse_brown_conrady",
-    "modified_brown_conrady",
-];
-
-/// Lens distortion of a calibration: model plumb_bob, under any of its names, or none.
+/// Lens of a calibration.
 fn distortion_from_msg(info: &sensor_msgs::CameraInfo) -> Result<Distortion, ConvertError> {
     all_finite("d", &info.d)?;
-    // librealsense writes "Inverse Brown Conrady".
-    let model = info
-        .distortion_model
-        .to_lowercase()
-        .replace([' ', '-'], "_");
-    let undistorted = info.d.iter().all(|coefficient| *coefficient == 0.0);
-    if undistorted && model != "plumb_bob" && PINHOLE_MODELS.contains(&model.as_str()) {
-        return Ok(Distortion::NONE);
-    }
-    let too_many = |expected: &'static str| unexpected("d", format!("{:?}", info.d), expected);
-    match (model.as_str(), info.d.as_slice()) {
-        ("plumb_bob" | "brown_conrady", []) => Ok(Distortion::NONE),
-        ("plumb_bob" | "brown_conrady", &[k1, k2, p1, p2]) => Ok(Distortion {
-            k1,
-            k2,
-            p1,
-            p2,
-            k3: 0.0,
-        }),
-        ("plumb_bob" | "brown_conrady", &[k1, k2, p1, p2, k3]) => {
-            Ok(Distortion { k1, k2, p1, p2, k3 })
-        }
-        ("plumb_bob" | "brown_conrady", _) => Err(too_many("k1, k2, p1, p2 and k3 of plumb_bob")),
-        // The polynomial in the denominator is 1.
-        ("rational_polynomial", &[k1, k2, p1, p2, k3, k4, k5, k6]) if [k4, k5, k6] == [0.0; 3] => {
-            Ok(Distortion { k1, k2, p1, p2, k3 })
-        }
-        _ => Err(unexpected(
-            "distortion_model",
-            format!("{:?} with d {:?}", info.distortion_model, info.d),
-            "\"plumb_bob\", or a pinhole model with d of zeros",
-        )),
-    }
+    Distortion::from_model(&info.distortion_model, &info.d)
+        .map_err(|error| unexpected(error.field, error.actual, error.expected))
 }
 
-/// Intrinsics of a full-size image, with distortion after plumb_bob: no binning, no region of interest.
+/// Intrinsics of a full-size image: no binning, no region of interest.
 pub fn intrinsics_from_msg(info: &sensor_msgs::CameraInfo) -> Result<Intrinsics, ConvertError> {
     let at_least_one = |field, value: u32| match value {
         0 => Err(unexpected(field, 0, "at least 1")),
@@ -322,14 +278,14 @@ pub fn intrinsics_to_msg(header: std_msgs::Header, camera: &Intrinsics) -> senso
         fy_px: fy,
         cx_px: cx,
         cy_px: cy,
-        distortion: Distortion { k1, k2, p1, p2, k3 },
+        distortion,
     } = *camera;
     sensor_msgs::CameraInfo {
         header,
         height: height as u32,
         width: width as u32,
-        distortion_model: "plumb_bob".to_owned(),
-        d: vec![k1, k2, p1, p2, k3],
+        distortion_model: distortion.model().to_owned(),
+        d: distortion.coefficients(),
         k: [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0],
         r: [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0],
         p: [fx, 0.0, cx, 0.0, 0.0, fy, cy, 0.0, 0.0, 0.0, 1.0, 0.0],
@@ -509,29 +465,35 @@ mod tests {
 
     #[test]
     fn the_distortion_of_a_calibration_is_read() {
-        let lens = Distortion {
-            k1: 0.1,
-            k2: -0.2,
-            p1: 0.003,
-            p2: -0.004,
-            k3: 0.05,
-        };
+        let rational = [0.5, -2.6, 0.0007, -0.0002, 1.5, 0.4, -2.4, 1.4];
+        for distortion in [
+            Distortion::plumb_bob([0.1, -0.2, 0.003, -0.004, 0.05]),
+            Distortion::rational(rational),
+            Distortion::equidistant([0.1, -0.02, 0.003, -0.001]),
+        ] {
+            let camera = Intrinsics {
+                distortion,
+                ..CAMERA
+            };
+            let info = intrinsics_to_msg(Default::default(), &camera);
+            assert_eq!(info.distortion_model, distortion.model());
+            assert_eq!(intrinsics_from_msg(&info).unwrap(), camera);
+        }
+        let lens = Distortion::plumb_bob([0.1, -0.2, 0.003, -0.004, 0.05]);
         let camera = Intrinsics {
             distortion: lens,
             ..CAMERA
         };
         let mut info = intrinsics_to_msg(Default::default(), &camera);
-        assert_eq!(intrinsics_from_msg(&info).unwrap(), camera);
+        // The polynomial in the denominator is 1.
         info.distortion_model = "rational_polynomial".into();
         info.d.extend([0.0; 3]);
         assert_eq!(intrinsics_from_msg(&info).unwrap(), camera);
-        info.d[7] = 0.1;
-        assert!(intrinsics_from_msg(&info).is_err());
         // Four coefficients are three radial ones less.
         info.distortion_model = "plumb_bob".into();
         info.d.truncate(4);
         let read = intrinsics_from_msg(&info).unwrap().distortion;
-        assert_eq!(read, Distortion { k3: 0.0, ..lens });
+        assert_eq!(read, Distortion::plumb_bob([0.1, -0.2, 0.003, -0.004, 0.0]));
         // None, in the ways in which drivers say so.
         info.d.clear();
         assert!(intrinsics_from_msg(&info).unwrap().distortion.is_none());
@@ -550,20 +512,17 @@ mod tests {
         assert!(refusal(|info| info.d[1] = f64::NAN).starts_with("d[1] is not finite"));
         assert!(refusal(|info| info.d.push(0.1)).starts_with("d is"));
         assert!(refusal(|info| info.d.truncate(2)).starts_with("d is"));
-        for (model, k1) in [
-            ("equidistant", 0.0),
-            ("fisheye", 0.0),
-            ("rational_polynomial", 0.1),
-            ("inverse_brown_conrady", 0.1),
+        for (model, field) in [
+            ("equidistant", "d is"),
+            ("rational_polynomial", "d is"),
+            ("inverse_brown_conrady", "distortion_model is"),
+            ("omnidirectional", "distortion_model is"),
         ] {
             let mut info = good.clone();
-            info.d[0] = k1;
+            info.d[0] = 0.1;
             info.distortion_model = model.to_owned();
             let error = intrinsics_from_msg(&info).unwrap_err().to_string();
-            assert!(
-                error.starts_with("distortion_model is") && error.contains(model),
-                "{error}"
-            );
+            assert!(error.starts_with(field) && error.contains(model), "{error}");
         }
         assert!(
             refusal(|info| {

@@ -269,6 +269,14 @@ pub fn joint_trajectory_to_msg(
     trajectory: &JointTrajectory,
     names: &[impl AsRef<str>; 6],
 ) -> Result<trajectory_msgs::JointTrajectory, ConvertError> {
+    trajectory_points_to_msg(trajectory.points(), names)
+}
+
+/// Points that need not make a trajectory, none for instance.
+pub fn trajectory_points_to_msg(
+    points: &[TrajectoryPoint],
+    names: &[impl AsRef<str>; 6],
+) -> Result<trajectory_msgs::JointTrajectory, ConvertError> {
     let point = |point: &TrajectoryPoint| {
         Ok::<_, ConvertError>(trajectory_msgs::JointTrajectoryPoint {
             positions: point.positions_rad.iter().copied().collect(),
@@ -279,11 +287,7 @@ pub fn joint_trajectory_to_msg(
     };
     Ok(trajectory_msgs::JointTrajectory {
         joint_names: names.iter().map(|name| name.as_ref().to_owned()).collect(),
-        points: trajectory
-            .points()
-            .iter()
-            .map(point)
-            .collect::<Result<_, _>>()?,
+        points: points.iter().map(point).collect::<Result<_, _>>()?,
         ..Default::default()
     })
 }

@@ -107,12 +107,13 @@ pub fn proposal_to_msg(proposal: &Proposal) -> Result<sctn_msgs::PickPlace, Conv
         success_probability: proposal.success_probability.unwrap_or(-1.0),
         checkpoint: proposal.checkpoint.clone(),
         author: proposal.author.clone(),
+        done_probability: proposal.done_probability.unwrap_or(-1.0),
     })
 }
 
 /// A proposal with finite poses and positive settings.
 pub fn proposal_from_msg(msg: &sctn_msgs::PickPlace) -> Result<Proposal, ConvertError> {
-    let probability = Some(msg.success_probability);
+    let probability = |value: f32| (0.0..=1.0).contains(&value).then_some(value);
     Ok(Proposal {
         id: ProposalId(msg.id),
         frame: msg.header.frame_id.clone(),
@@ -125,9 +126,10 @@ pub fn proposal_from_msg(msg: &sctn_msgs::PickPlace) -> Result<Proposal, Convert
         settings: settings_from_msg(&msg.settings).map_err(part("settings"))?,
         pick_score: msg.pick_score,
         place_score: msg.place_score,
-        success_probability: probability.filter(|probability| (0.0..=1.0).contains(probability)),
+        success_probability: probability(msg.success_probability),
         checkpoint: msg.checkpoint.clone(),
         author: msg.author.clone(),
+        done_probability: probability(msg.done_probability),
     })
 }
 
@@ -279,6 +281,7 @@ mod tests {
             success_probability: Some(0.25),
             checkpoint: "a checkpoint".into(),
             author: "a policy".into(),
+            done_probability: Some(0.125),
         }
     }
 

@@ -98,13 +98,15 @@ class Filler:
 
 
 def check_with_rclpy(package, kind, name, bytes_, store):
-    """Whether rclpy reads the same numbers from these bytes; packages that are not installed are skipped."""
+    """Whether rclpy reads the same numbers from these bytes; packages and types that are not installed are skipped."""
     try:
         module = importlib.import_module(f"{package}.{kind}")
         from rclpy.serialization import deserialize_message, serialize_message
     except ImportError:
         return False
     parts = name.split("_")
+    if not hasattr(module, parts[0]):
+        return False
     kind_class = getattr(module, parts[0])
     for part in parts[1:]:
         kind_class = getattr(kind_class, part)

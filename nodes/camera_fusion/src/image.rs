@@ -6,7 +6,7 @@ use msgs::convert::{self, ConvertError};
 use msgs::sensor_msgs;
 
 /// A message, decoded only when it is fused.
-pub(crate) struct ImageMessage(pub(crate) sensor_msgs::Image);
+pub struct ImageMessage(pub sensor_msgs::Image);
 
 impl Image for ImageMessage {
     type Error = ConvertError;

@@ -27,9 +27,9 @@ use node_kit::{
 use tokio::sync::mpsc;
 use tracing::{info, warn};
 
-use image::ImageMessage;
 use outputs::Outputs;
 
+pub use image::ImageMessage;
 pub use parameters::{CameraFusionParameters, WorkspaceParameters};
 
 /// Messages between their subscriptions and the fusion.
@@ -209,10 +209,9 @@ impl FusionNode {
         camera: &str,
         arrivals: &mpsc::Sender<Arrival>,
     ) -> anyhow::Result<()> {
-        let color = format!("{camera}/color/image_raw");
-        let depth = format!("{camera}/depth/image_rect_raw");
+        let topics = self.parameters.camera_preset.topics(camera);
         let mut images = Vec::new();
-        for (topic, stream) in [(color, Stream::Color), (depth, Stream::Depth)] {
+        for (topic, stream) in [(topics.color, Stream::Color), (topics.depth, Stream::Depth)] {
             let mut subscription = ImageSubscription::<Image>::new(node, &topic)?;
             images.push(Arc::clone(subscription.statistics()));
             let arrivals = arrivals.clone();
@@ -230,8 +229,10 @@ impl FusionNode {
             });
         }
         let mut infos = Vec::new();
-        for (topic, stream) in [("color", Stream::Info), ("depth", Stream::DepthInfo)] {
-            let topic = format!("{camera}/{topic}/camera_info");
+        for (topic, stream) in [
+            (topics.color_info, Stream::Info),
+            (topics.depth_info, Stream::DepthInfo),
+        ] {
             let mut subscription = node.subscription::<CameraInfo>(&topic, Qos::Image)?;
             infos.push(Arc::clone(subscription.statistics()));
             let arrivals = arrivals.clone();

@@ -5,6 +5,7 @@ use std::time::Duration;
 
 use frame_synchronizer::Settings;
 use heightmap::{StillSettings, Workspace};
+use msgs::CameraPreset;
 use nalgebra::Point2;
 use node_kit::{InvalidParameter, Parameters, Range};
 use serde::{Deserialize, Serialize};
@@ -18,6 +19,7 @@ const MAX_CELLS: usize = 1 << 22;
 #[allow(missing_docs)]
 pub struct CameraFusionParameters {
     pub cameras: Vec<String>,
+    pub camera_preset: CameraPreset,
     pub world_frame: String,
     pub calibration: PathBuf,
     pub tolerance_s: f64,
@@ -48,6 +50,7 @@ impl Default for CameraFusionParameters {
     fn default() -> Self {
         Self {
             cameras: ["front", "left", "right"].map(str::to_owned).to_vec(),
+            camera_preset: CameraPreset::Simulated,
             world_frame: "world".into(),
             calibration: PathBuf::new(),
             tolerance_s: 0.02,
@@ -78,7 +81,8 @@ impl Default for WorkspaceParameters {
 }
 
 impl WorkspaceParameters {
-    pub(crate) fn workspace(&self) -> Workspace {
+    /// As the fusion takes it.
+    pub fn workspace(&self) -> Workspace {
         Workspace {
             origin_m: Point2::new(self.origin_x_m, self.origin_y_m),
             rows: self.rows,
@@ -91,8 +95,18 @@ impl WorkspaceParameters {
 }
 
 impl CameraFusionParameters {
-    pub(crate) fn tolerance(&self) -> Duration {
+    /// How far apart images of one set may be.
+    pub fn tolerance(&self) -> Duration {
         Duration::from_secs_f64(self.tolerance_s)
+    }
+
+    /// How the median is taken; nothing where each set of images is a heightmap.
+    pub fn still(&self) -> Option<StillSettings> {
+        (self.frames > 1).then_some(StillSettings {
+            frames: self.frames,
+            percentile: self.percentile,
+            edge_step_m: self.edge_step_m as f32,
+        })
     }
 
     /// As the synchronizer takes them.
@@ -102,11 +116,7 @@ impl CameraFusionParameters {
             world_frame: self.world_frame.clone(),
             tolerance: self.tolerance(),
             workspace: self.workspace.workspace(),
-            still: (self.frames > 1).then_some(StillSettings {
-                frames: self.frames,
-                percentile: self.percentile,
-                edge_step_m: self.edge_step_m as f32,
-            }),
+            still: self.still(),
             fuse_without_silent: self.fuse_without_silent,
         }
     }
@@ -136,6 +146,9 @@ impl Parameters for CameraFusionParameters {
             return Err(InvalidParameter::new("cameras", "must name at least one"));
         }
         for (index, camera) in self.cameras.iter().enumerate() {
+            if camera.is_empty() {
+                return Err(InvalidParameter::new("cameras", "a name must not be empty"));
+            }
             if self.cameras[..index].contains(camera) {
                 return Err(InvalidParameter::new(
                     "cameras",
@@ -182,6 +195,22 @@ mod tests {
     }
 
     #[test]
+    fn a_preset_is_read_by_its_name_and_an_unknown_one_is_refused() {
+        let read = |preset: &str| {
+            let text = format!("/**: {{ros__parameters: {{camera_preset: {preset}}}}}");
+            node_kit::load_text::<CameraFusionParameters>("cell.yaml", &text, "/camera_fusion")
+        };
+        for name in CameraPreset::names() {
+            assert_eq!(read(name).unwrap().camera_preset.to_string(), name);
+        }
+        let error = read("kinect").unwrap_err().to_string();
+        assert!(
+            error.contains("camera_preset") && error.contains("realsense_aligned"),
+            "{error}"
+        );
+    }
+
+    #[test]
     fn impossible_values_are_refused_by_name() {
         let refusal = |spoil: fn(&mut CameraFusionParameters)| {
             let mut parameters = CameraFusionParameters::default();
@@ -190,6 +219,7 @@ mod tests {
         };
         assert_eq!(refusal(|p| p.cameras.clear()), "cameras");
         assert_eq!(refusal(|p| p.cameras[1] = "front".into()), "cameras");
+        assert_eq!(refusal(|p| p.cameras[1].clear()), "cameras");
         assert_eq!(refusal(|p| p.tolerance_s = f64::NAN), "tolerance_s");
         assert_eq!(refusal(|p| p.camera_timeout_s = 0.0), "camera_timeout_s");
         assert_eq!(refusal(|p| p.frames = 0), "frames");

@@ -1,7 +1,6 @@
 //! Whether a heightmap may show the arm.
 
 use std::future::pending;
-use std::path::Path;
 use std::time::Duration;
 
 use anyhow::Context as _;
@@ -21,11 +20,7 @@ pub(crate) struct ArmView {
 
 impl ArmView {
     pub(crate) fn new(node: &Node, parameters: &GctnPolicyParameters) -> anyhow::Result<Self> {
-        let work_cell = match parameters.urdf.as_path() {
-            path if path == Path::new("") => WorkCell::builtin(),
-            path => WorkCell::load(path),
-        }
-        .context("parameter urdf")?;
+        let work_cell = WorkCell::load_or_builtin(&parameters.urdf).context("parameter urdf")?;
         let joint_states = match parameters.observation_needs_home {
             true => Some(node.subscription("joint_states", Qos::Event)?),
             false => None,

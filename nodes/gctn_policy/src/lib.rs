@@ -269,7 +269,7 @@ impl PolicyNode {
     }
 }
 
-/// Decisions that are none concern the planner as little as those on a motion.
+/// Tells the planner of a confirmation; an invalid one is ignored here, the executor refuses it.
 fn confirm(planner: &mut ProposalPlanner, message: &StepConfirmation) {
     if let Ok(confirmation) = convert::confirmation_from_msg(message) {
         planner.on_confirmation(&confirmation);
@@ -296,6 +296,7 @@ fn prediction(decision: &Decision) -> Prediction {
         pick_score: decision.pick_score as f32,
         place_score: decision.place_score as f32,
         success_probability: decision.success.map(|probability| probability as f32),
+        done_probability: decision.done.map(|probability| probability as f32),
     }
 }
 

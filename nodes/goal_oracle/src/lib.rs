@@ -17,7 +17,7 @@ use msgs::{
         PrimitiveSettings, SetStep, SetStepRequest, SetStepResponse, StepConfirmation, StepResult,
     },
 };
-use node_kit::{Active, Level, Node, Publisher, Qos, ReplyCache};
+use node_kit::{Active, Level, Node, Publisher, Qos, ReplyCache, Subscription};
 use step_protocol::{
     Capture, Change, ConfirmationRefusal, GoalSequence, GoalTracker, Observation, ProposalId,
     StepJudge,
@@ -84,9 +84,22 @@ fn read_goals(path: &Path) -> anyhow::Result<GoalSequence> {
     goals.with_context(|| format!("demonstration {shown}"))
 }
 
+/// A proposal was published, or came as a goal of the executor's action.
+fn follow_proposal(
+    tracker: &mut GoalTracker,
+    topic: &Subscription<PickPlace>,
+    message: &PickPlace,
+) {
+    match convert::proposal_from_msg(message) {
+        Ok(proposal) => tracker.on_proposal(&proposal),
+        Err(error) => topic.reject(error),
+    }
+}
+
 impl Active for OracleNode {
     async fn run(&mut self, node: &Node) -> anyhow::Result<()> {
         let mut proposals = node.subscription::<PickPlace>("pick_place", Qos::Latched)?;
+        let mut accepted = node.subscription::<PickPlace>("pick_place_goal", Qos::Event)?;
         let mut results = node.subscription::<StepResult>("step_result", Qos::Event)?;
         let mut confirmations =
             node.subscription::<StepConfirmation>("step_confirmation", Qos::Event)?;
@@ -106,10 +119,11 @@ impl Active for OracleNode {
         loop {
             let change = tokio::select! {
                 proposal = proposals.recv() => {
-                    match convert::proposal_from_msg(&proposal) {
-                        Ok(proposal) => self.tracker.on_proposal(&proposal),
-                        Err(error) => proposals.reject(error),
-                    }
+                    follow_proposal(&mut self.tracker, &proposals, &proposal);
+                    Change::None
+                }
+                proposal = accepted.recv() => {
+                    follow_proposal(&mut self.tracker, &accepted, &proposal);
                     Change::None
                 }
                 result = results.recv() => match convert::result_from_msg(&result) {
@@ -343,7 +357,7 @@ impl OracleNode {
 
     fn refuse(&self, id: ProposalId, refusal: &ConfirmationRefusal) {
         warn!("confirmation refused: {refusal}");
-        let now = Duration::from_nanos(self.node.clock().now_ns().max(0) as u64);
+        let now = self.node.clock().time();
         let world = &self.parameters.world_frame;
         match convert::confirmation_refused_to_msg(id, refusal, now, world) {
             Ok(message) => self.refusals.publish(message),

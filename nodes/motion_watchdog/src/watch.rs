@@ -2,11 +2,11 @@
 
 use std::time::{Duration, Instant};
 
-/// What the executor has last been heard to say, and when.
+/// The executor's last heartbeat.
 #[derive(Clone, Copy, Debug)]
 pub struct Watch {
     timeout: Duration,
-    /// When it was last said that a motion is under way; nothing since it was said that none is.
+    /// When the last heartbeat of a motion under way came; `None` after one that says that nothing moves.
     moving_at: Option<Instant>,
 }
 

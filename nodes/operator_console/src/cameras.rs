@@ -5,12 +5,13 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use console::Cameras;
+use msgs::CameraTopicNames;
 use msgs::convert::{self, ConvertError};
 use msgs::sensor_msgs::{CameraInfo, Image};
 use msgs::tf2_msgs::TFMessage;
 use node_kit::{Node, Qos};
 
-/// How often it is looked whether somebody looks.
+/// Time between checks whether a browser shows camera images.
 const POLL: Duration = Duration::from_millis(250);
 
 /// Keeps the transforms, for as long as the node is active.
@@ -26,16 +27,20 @@ pub async fn follow_transforms(node: Node, cameras: Arc<Cameras>) -> anyhow::Res
 }
 
 /// Keeps the newest image of a camera while somebody looks, for as long as the node is active.
-pub async fn follow(node: Node, cameras: Arc<Cameras>, name: String) -> anyhow::Result<()> {
+pub async fn follow(
+    node: Node,
+    cameras: Arc<Cameras>,
+    name: String,
+    topics: CameraTopicNames,
+) -> anyhow::Result<()> {
     let mut poll = tokio::time::interval(POLL);
     loop {
         poll.tick().await;
         if !cameras.are_wanted() {
             continue;
         }
-        let topic = |part| format!("{name}/color/{part}");
-        let mut infos = node.subscription::<CameraInfo>(&topic("camera_info"), Qos::Image)?;
-        let mut images = node.subscription::<Image>(&topic("image_raw"), Qos::Image)?;
+        let mut infos = node.subscription::<CameraInfo>(&topics.color_info, Qos::Image)?;
+        let mut images = node.subscription::<Image>(&topics.color, Qos::Image)?;
         while cameras.are_wanted() {
             tokio::select! {
                 message = infos.recv() => match convert::intrinsics_from_msg(&message) {

@@ -17,9 +17,9 @@ pub enum Invalid {
     /// A part of it.
     #[error("{field}.{source}")]
     Part {
-        /// Which.
+        /// The field.
         field: String,
-        /// Why.
+        /// The reason.
         source: ConvertError,
     },
     /// A plan.
@@ -111,7 +111,7 @@ pub fn scores_from_msg(image: Image) -> Result<ScoreMaps, Invalid> {
     })
 }
 
-/// What a node says of a part of itself; nothing where the status has no `NODE: PART` as its name.
+/// What a node says of a part of itself; `None` where the status has no `NODE: PART` as its name.
 pub fn report_from_msg(status: DiagnosticStatus) -> Option<NodeReport> {
     let (node, state) = status.name.split_once(": ")?;
     let values = status.values.into_iter();

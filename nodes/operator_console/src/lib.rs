@@ -6,18 +6,15 @@ mod commands;
 mod convert;
 mod parameters;
 
-use std::fs::OpenOptions;
-use std::io::Write as _;
-use std::os::unix::fs::OpenOptionsExt as _;
 use std::path::Path;
 use std::pin::Pin;
 use std::sync::Arc;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 use anyhow::Context as _;
 use console::{
-    Access, Cameras, Checkpoints, Console, Libraries, Listener, Page, Phase, Run, Sessions,
-    TlsAcceptor, Trainings, Watch,
+    Access, Cameras, Checkpoints, Console, Libraries, Listener, Page, Run, Sessions, TlsAcceptor,
+    Trainings, Watch,
 };
 use msgs::convert::{
     confirmation_from_msg, confirmation_refused_from_msg, goal_from_msg, observation_from_msg,
@@ -32,20 +29,16 @@ use msgs::sensor_msgs::{Image, JointState};
 use msgs::std_msgs::{self, Bool, Float64};
 use msgs::ur_dashboard_msgs::{RobotMode, SafetyMode};
 use msgs::ur_msgs::IOStates;
-use node_kit::{Active, Level, Node, Qos};
+use node_kit::{Active, Level, Node, Qos, Subscription};
+use step_protocol::PRESENCE_PERIOD;
 use tokio::time::MissedTickBehavior;
 use tokio_util::sync::CancellationToken;
 use tracing::{info, warn};
 
-use crate::commands::{Commands, show_demonstration};
+use crate::commands::Commands;
 use crate::convert::{joints_from_msg, level, motion_from_msg, report_from_msg, scores_from_msg};
 
 pub use parameters::{OperatorConsoleParameters, Tls};
-
-/// Time between messages that say whether the operator is present.
-const PRESENCE_PERIOD: Duration = Duration::from_millis(200);
-/// Joint states are taken over at most this often: a UR5 sends 500 a second.
-const JOINTS_PERIOD: Duration = Duration::from_millis(100);
 
 /// Reads certificate and key; what it returns serves the page while it is active.
 pub async fn configure(
@@ -70,6 +63,11 @@ pub async fn configure(
             .map(|name| node.resolve(name))
             .collect(),
         executor: node.resolve(&parameters.executor),
+        image_topics: parameters
+            .camera_preset
+            .image_endings()
+            .map(str::to_owned)
+            .into(),
         stale_after: Duration::from_secs_f64(parameters.stale_after_s),
         changes: heightmap::ChangeRules::new(
             parameters.observation_tolerance_m,
@@ -120,21 +118,21 @@ impl Active for ConsoleNode {
         let mut commands = console.connect();
         let end = CancellationToken::new();
         let _ended = end.clone().drop_guard();
-        if self.parameters.demonstration != Path::new("") {
-            let path = self.parameters.demonstration.clone();
-            show_demonstration(node, &console, path).await;
-        }
-        let libraries = Arc::clone(&self.page.libraries);
-        let open_run = node.spawn_blocking(move || libraries.history.open_run());
-        if let Some(run) = open_run.await.context("reading the history panicked")? {
-            console.change(|state, _| state.resume_run(run));
-        }
+        let (page, demonstration) = (self.page.clone(), self.parameters.demonstration.clone());
+        let read = node.spawn_blocking(move || {
+            if demonstration != Path::new("") {
+                page.show_demonstration(&demonstration);
+            }
+            page.resume_run();
+        });
+        read.await.context("reading the library panicked")?;
         self.serve(node, &end).await?;
         self.follow_cameras(node, &end);
         let io_and_status = |name| format!("{}/{name}", self.parameters.io_and_status);
         let mut heightmaps = node.subscription::<Heightmap>("heightmap", Qos::Latched)?;
         let mut goals = node.subscription::<Goal>("goal", Qos::Latched)?;
         let mut proposals = node.subscription::<PickPlace>("pick_place", Qos::Latched)?;
+        let mut accepted = node.subscription::<PickPlace>("pick_place_goal", Qos::Event)?;
         let mut confirmations =
             node.subscription::<StepConfirmation>("step_confirmation", Qos::Event)?;
         let mut results = node.subscription::<StepResult>("step_result", Qos::Event)?;
@@ -156,7 +154,7 @@ impl Active for ConsoleNode {
         let mut scores = node.subscription::<Image>("pick_place/scores", Qos::Latched)?;
         let mut descriptions =
             node.subscription::<std_msgs::String>("robot_description", Qos::Latched)?;
-        let mut joints_taken: Option<Instant> = None;
+        let mut heartbeats = node.subscription::<Bool>("motion_heartbeat", Qos::Event)?;
         let mut presence = tokio::time::interval(PRESENCE_PERIOD);
         presence.set_missed_tick_behavior(MissedTickBehavior::Delay);
         loop {
@@ -176,14 +174,8 @@ impl Active for ConsoleNode {
                         goals.reject(error);
                     }
                 }
-                message = proposals.recv() => {
-                    let proposal = proposal_from_msg(&message).map_err(anyhow::Error::from);
-                    let shown = proposal
-                        .and_then(|proposal| Ok(console.change(|state, now| state.on_proposal(proposal, now))?));
-                    if let Err(error) = shown {
-                        proposals.reject(error);
-                    }
-                }
+                message = proposals.recv() => show_proposal(&console, &proposals, &message),
+                message = accepted.recv() => show_proposal(&console, &accepted, &message),
                 message = confirmations.recv() => match confirmation_from_msg(&message) {
                     Ok(confirmation) => console.change(|state, now| state.on_confirmation(&confirmation, now)),
                     Err(refusal) => confirmations.reject(refusal),
@@ -219,48 +211,44 @@ impl Active for ConsoleNode {
                         reports.for_each(|report| state.run.on_report(report, now));
                     });
                 }
-                message = joints.recv() => {
-                    if joints_taken.is_none_or(|taken| taken.elapsed() >= JOINTS_PERIOD) {
-                        joints_taken = Some(Instant::now());
-                        match joints_from_msg(message) {
-                            Ok((names, positions_rad)) => show_joints(&console, names, positions_rad),
-                            Err(error) => joints.reject(error),
-                        }
+                message = joints.recv() => match joints_from_msg(message) {
+                    Ok((names, positions_rad)) => {
+                        console.hear(|state, now| state.run.on_joints(names, positions_rad, now));
                     }
+                    Err(error) => joints.reject(error),
+                },
+                message = heartbeats.recv() => {
+                    console.change_quietly(|state, now| state.run.on_motion(message.data, now));
                 }
                 message = pins.recv() => {
                     let suction = level(&message.digital_out_states, self.parameters.suction_pin);
                     let vacuum = level(&message.digital_in_states, self.parameters.vacuum_pin);
-                    console.change_quietly(|state, _| state.run.on_robot(|robot| {
-                        robot.suction = suction;
-                        robot.vacuum = vacuum;
-                    }));
+                    console.hear(|state, _| state.run.on_pins(suction, vacuum));
                 }
                 message = robot_modes.recv() => {
-                    console.change(|state, _| state.run.on_robot(|robot| robot.robot_mode = Some(message.mode)));
+                    console.change(|state, _| state.run.on_robot_mode(message.mode));
                 }
                 message = safety_modes.recv() => {
-                    console.change(|state, _| state.run.on_robot(|robot| robot.safety_mode = Some(message.mode)));
+                    console.change(|state, _| state.run.on_safety_mode(message.mode));
                 }
                 message = speeds.recv() => {
-                    // The driver tells percents.
-                    let share = (message.data.is_finite()).then_some(message.data / 100.0);
-                    console.change_quietly(|state, _| state.run.on_robot(|robot| robot.speed_scaling = share));
+                    console.change_quietly(|state, _| state.run.on_speed_scaling(message.data));
                 }
                 message = running.recv() => {
-                    console.change(|state, _| state.run.on_robot(|robot| robot.program_running = Some(message.data)));
+                    console.change(|state, _| state.run.on_program(message.data));
                 }
             }
         }
     }
 }
 
-/// Viewers see the arm move.
-fn show_joints(console: &Console, names: Vec<String>, positions_rad: Vec<f64>) {
-    let change = |state: &mut console::State, now| state.run.on_joints(names, positions_rad, now);
-    match console.read(|state, _| state.run.phase()) {
-        Phase::Moving => console.change(change),
-        _ => console.change_quietly(change),
+/// Viewers see a proposal, of a topic or of the executor's action.
+fn show_proposal(console: &Console, topic: &Subscription<PickPlace>, message: &PickPlace) {
+    let proposal = proposal_from_msg(message).map_err(anyhow::Error::from);
+    let shown = proposal
+        .and_then(|proposal| Ok(console.change(|state, now| state.on_proposal(proposal, now))?));
+    if let Err(error) = shown {
+        topic.reject(error);
     }
 }
 
@@ -271,30 +259,25 @@ impl ConsoleNode {
         let listener = Listener::bind(socket, self.tls.clone())
             .await
             .with_context(|| format!("parameters address and port: cannot listen on {socket}"))?;
-        let address = listener.address();
-        let tls = self.tls.is_some();
-        let scheme = if tls { "https" } else { "http" };
-        let page = format!("{scheme}://{address}/#token={}", self.token);
-        if self.parameters.address_file == Path::new("") {
-            // Standard output may be a program's result.
-            eprintln!("operator console: {page}");
-        } else {
-            write_address(&self.parameters.address_file, &page)?;
-        }
-        // Logs go to every node: never the token.
-        info!("the operator's page is served on {scheme}://{address}/");
-        node.diagnostics().set(
-            "page",
-            Level::Ok,
-            format!("served on {scheme}://{address}/"),
-            [],
-        );
         let access = Access::new(
             self.token.clone(),
-            address,
+            listener.address(),
             &self.parameters.host_names,
-            tls,
+            self.tls.is_some(),
         );
+        let file = &self.parameters.address_file;
+        if file == Path::new("") {
+            // Standard output may be a program's result.
+            eprintln!("operator console: {}", access.page());
+        } else {
+            access
+                .write_page(file)
+                .with_context(|| format!("parameter address_file: {}", file.display()))?;
+        }
+        // Logs go to every node: never the token.
+        let served = format!("served on {}", access.address());
+        info!("the operator's page is {served}");
+        node.diagnostics().set("page", Level::Ok, served, []);
         let router = console::router(self.page.clone(), access, end.clone());
         let ended = end.clone().cancelled_owned();
         tokio::spawn(async move {
@@ -329,20 +312,9 @@ impl ConsoleNode {
             .iter()
             .filter(|name| !name.is_empty())
         {
-            let images = cameras::follow(node.clone(), cameras(), name.clone());
+            let topics = self.parameters.camera_preset.topics(name);
+            let images = cameras::follow(node.clone(), cameras(), name.clone(), topics);
             watch(format!("camera {name}"), Box::pin(images));
         }
     }
-}
-
-/// Whole or not at all, for the owner alone: it holds the token.
-fn write_address(path: &Path, page: &str) -> anyhow::Result<()> {
-    let shown = || format!("parameter address_file: {}", path.display());
-    let mut partial = path.as_os_str().to_owned();
-    partial.push(".partial");
-    let mut options = OpenOptions::new();
-    options.write(true).create(true).truncate(true).mode(0o600);
-    let mut file = options.open(&partial).with_context(shown)?;
-    writeln!(file, "{page}").with_context(shown)?;
-    std::fs::rename(&partial, path).with_context(shown)
 }

@@ -3,6 +3,7 @@
 mod images;
 mod motion;
 mod reports;
+mod shutter;
 
 use std::sync::atomic::Ordering;
 use std::sync::{Arc, mpsc};
@@ -19,12 +20,13 @@ use msgs::tf2_msgs::TFMessage;
 use msgs::ur_msgs::SetIORequest;
 use multiravens::Problem;
 use node_kit::{Node, Publisher, Qos, ReplyCache};
-use simulated_cell::{Pins, SimulatedCell};
+use simulated_cell::{Output, Pins, SimulatedCell};
 use tokio::sync::oneshot;
 use tracing::{info, warn};
 use ur5::WorkCell;
 
 use self::reports::fixed_transforms;
+use self::shutter::Shutter;
 use crate::node::{Command, Shared};
 use crate::parameters::SimWorkcellParameters;
 
@@ -58,7 +60,9 @@ pub(crate) struct Hardware {
     /// Of the arm's links.
     tf: Option<Publisher<TFMessage>>,
     reward: Publisher<Reward>,
-    cameras: Vec<CameraTopics>,
+    cameras: Arc<Vec<CameraTopics>>,
+    /// Of noisy cameras where time goes on by itself.
+    shutter: Option<Shutter>,
     /// Latched.
     tf_static: Publisher<TFMessage>,
     /// Latched, said once; kept so that late joiners hear them.
@@ -89,7 +93,9 @@ impl Hardware {
         let topics = cameras
             .iter()
             .map(|camera| CameraTopics::new(node, &camera.name));
-        let topics = topics.collect::<Result<_, _>>()?;
+        let topics: Arc<Vec<CameraTopics>> = Arc::new(topics.collect::<Result<_, _>>()?);
+        let free_running = parameters.hardware.free_running && cell.environment().rig().is_some();
+        let shutter = free_running.then(|| Shutter::new(Arc::clone(&topics)));
         let tf_static = node.publisher("/tf_static", Qos::Latched)?;
         let robot_description = match parameters.publish_robot {
             false => None,
@@ -130,6 +136,7 @@ impl Hardware {
             commands,
             shared,
             cameras: topics,
+            shutter,
             tf_static,
             acceptance,
             next: None,
@@ -194,7 +201,7 @@ impl Hardware {
             }
             if now >= self.next_frames {
                 if self.parameters.hardware.free_running
-                    && self.next_set == 0
+                    && self.shutter.is_none()
                     && self.cell.is_at_rest()
                 {
                     // A camera does not repeat images.
@@ -349,8 +356,19 @@ impl Hardware {
         if unchanged && self.parameters.hardware.fault == self.fault {
             return;
         }
-        self.parameters = parameters.borrow().clone();
+        let parameters = parameters.borrow().clone();
+        let before = std::mem::replace(&mut self.parameters, parameters);
         let hardware = &self.parameters.hardware;
+        if before.hardware.inactive_controllers != hardware.inactive_controllers {
+            let actions = self.parameters.actions();
+            self.shared.driver.set_controllers(&actions, hardware);
+        }
+        if before.hardware.tool_voltage != hardware.tool_voltage {
+            match Output::tool_voltage(f32::from(hardware.tool_voltage)) {
+                Ok(output) => self.cell.set(output),
+                Err(reason) => warn!("hardware.tool_voltage: {reason}"),
+            }
+        }
         self.cell.set_hardware(hardware);
         self.acceptance.set_hardware(hardware);
         let (before, fault) = (self.fault, hardware.fault);

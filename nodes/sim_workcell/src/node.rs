@@ -30,11 +30,7 @@ pub async fn configure(
     parameters: SimWorkcellParameters,
 ) -> anyhow::Result<HardwareNode> {
     let problem = Problem::load(&parameters.problems_dir, &parameters.problem)?;
-    let work_cell = match parameters.urdf.as_path() {
-        path if path == Path::new("") => WorkCell::builtin(),
-        path => WorkCell::load(path),
-    }
-    .context("parameter urdf")?;
+    let work_cell = WorkCell::load_or_builtin(&parameters.urdf).context("parameter urdf")?;
     if let Some(warning) = work_cell.warning() {
         warn!("parameter urdf: {warning}");
     }

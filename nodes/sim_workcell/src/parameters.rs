@@ -109,6 +109,8 @@ impl Parameters for SimWorkcellParameters {
         ("hardware.vacuum_build_s", DELAY),
         ("hardware.vacuum_release_s", DELAY),
         ("hardware.vacuum_leak_s", Range::NOT_NEGATIVE),
+        ("hardware.blow_off_pin", Range::Integer(-1, 17)),
+        ("hardware.enable_pin", Range::Integer(-1, 17)),
     ];
     const CHANGEABLE: &'static [&'static str] = &[
         "real_time_factor",
@@ -119,7 +121,10 @@ impl Parameters for SimWorkcellParameters {
         "hardware.servo_delay_s",
         "hardware.encoder_noise_rad",
         "hardware.speed_scaling",
+        "hardware.inactive_controllers",
+        "hardware.tool_voltage",
         "hardware.vacuum_leak_s",
+        "hardware.enabled",
         "hardware.fault",
     ];
 }

@@ -3,12 +3,10 @@
 //! [`step_protocol::ApprovalGate`] decides what may move, without middleware; the rest moves it through the driver's own
 //! topics, service and actions, and reports.
 
-mod dry_run;
+mod cell;
 mod node;
 mod parameters;
-mod presence;
 mod stop_memory;
-mod surface;
 
 pub use node::{ExecutorNode, configure};
-pub use parameters::{Contact, Limits, SuctionExecutorParameters};
+pub use parameters::{JointLimits, Limits, SuctionExecutorParameters};

@@ -3,10 +3,11 @@
 use std::path::PathBuf;
 
 use node_kit::{Parameters, Range};
-use pick_place::PrimitiveSettings;
+use pick_place::{ContactSettings, PrimitiveSettings};
 use serde::{Deserialize, Serialize};
 use step_protocol::RequireApproval;
 use ur_driver::DriverParameters;
+use ur5::Arm;
 
 /// Parameters of the node.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -16,6 +17,8 @@ pub struct SuctionExecutorParameters {
     pub require_approval: Approval,
     /// With `unsure`: proposals of at least this probability of success move unasked.
     pub sure_probability: f64,
+    /// Names of those whose approvals and rejections count; empty for everybody's.
+    pub operators: Vec<String>,
     /// Whether nothing moves while no operator is present.
     pub require_presence: bool,
     /// File that remembers a stop or fault over a restart; empty for none.
@@ -26,8 +29,12 @@ pub struct SuctionExecutorParameters {
     pub world_frame: String,
     /// URDF of the work cell; empty for the one that was compiled in.
     pub urdf: PathBuf,
+    /// The arm's factory calibration; empty for an arm as drawn.
+    pub arm_calibration: PathBuf,
     /// Largest heights and speeds of a proposal.
     pub limits: Limits,
+    /// What the joints may do in planned motions.
+    pub joints: JointLimits,
     /// A cell of the heightmap has changed when its height differs by more.
     pub observation_tolerance_m: f64,
     /// The observation has changed where so many mm^2 of connected cells have.
@@ -36,12 +43,12 @@ pub struct SuctionExecutorParameters {
     pub observation_max_age_s: f64,
     /// Whether heightmaps count only where the arm was at home and at rest when they were taken.
     pub observation_needs_home: bool,
-    /// Distance that the way home keeps from the cell and from what was seen (m).
+    /// Distance that the arm keeps from the cell and from what was seen (m).
     pub collision_margin_m: f64,
     /// Wall seconds that a confirmation waits for its proposal and heightmap.
     pub confirmation_grace_s: f64,
     /// How the tip comes down.
-    pub contact: Contact,
+    pub contact: ContactSettings,
     /// The driver and its wiring.
     pub driver: DriverParameters,
 }
@@ -72,29 +79,16 @@ pub struct Limits {
     pub acceleration_m_s2: f64,
 }
 
-/// How the tip comes down on surfaces that were seen.
+/// What the joints may do in planned motions.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
-pub struct Contact {
-    /// So far above the surface the tip slows down (m); 0: descents are fast to their end.
-    pub slow_from_m: f64,
-    /// Speed of the tip from there on (m/s).
-    pub slow_m_s: f64,
-    /// Contact higher than expected by more is a fault, and a descent ends so far below the surface (m).
-    pub window_m: f64,
-    /// The cup is pressed on by so much after contact (m).
-    pub press_m: f64,
-}
-
-impl Default for Contact {
-    fn default() -> Self {
-        Self {
-            slow_from_m: 0.0,
-            slow_m_s: 0.05,
-            window_m: 0.015,
-            press_m: 0.0,
-        }
-    }
+pub struct JointLimits {
+    /// Largest acceleration of each joint.
+    pub acceleration_rad_s2: f64,
+    /// Largest jerk of each joint.
+    pub jerk_rad_s3: f64,
+    /// So far from its place at home wrist 3 may turn, both ways, for a hose along the arm; 0: as far as the URDF says.
+    pub hose_turn_rad: f64,
 }
 
 impl Default for SuctionExecutorParameters {
@@ -102,19 +96,22 @@ impl Default for SuctionExecutorParameters {
         Self {
             require_approval: Approval::Always,
             sure_probability: 0.99,
+            operators: Vec::new(),
             require_presence: false,
             stop_file: PathBuf::new(),
             presence_timeout_s: 1.0,
             world_frame: "world".into(),
             urdf: PathBuf::new(),
+            arm_calibration: PathBuf::new(),
             limits: Limits::default(),
+            joints: JointLimits::default(),
             observation_tolerance_m: 0.005,
             observation_changed_area_mm2: 75.0,
             observation_max_age_s: 5.0,
             observation_needs_home: false,
             collision_margin_m: 0.01,
             confirmation_grace_s: 0.5,
-            contact: Contact::default(),
+            contact: ContactSettings::default(),
             driver: DriverParameters::default(),
         }
     }
@@ -129,6 +126,16 @@ impl Default for Limits {
             carry_m_s: 1.5,
             descend_m_s: 0.5,
             acceleration_m_s2: 10.0,
+        }
+    }
+}
+
+impl Default for JointLimits {
+    fn default() -> Self {
+        Self {
+            acceleration_rad_s2: Arm::DEFAULT_ACCELERATION_RAD_S2,
+            jerk_rad_s3: Arm::DEFAULT_JERK_RAD_S3,
+            hose_turn_rad: 0.0,
         }
     }
 }
@@ -172,6 +179,9 @@ impl Parameters for SuctionExecutorParameters {
         ("limits.carry_m_s", Range::POSITIVE),
         ("limits.descend_m_s", Range::POSITIVE),
         ("limits.acceleration_m_s2", Range::POSITIVE),
+        ("joints.acceleration_rad_s2", Range::POSITIVE),
+        ("joints.jerk_rad_s3", Range::POSITIVE),
+        ("joints.hose_turn_rad", Range::NOT_NEGATIVE),
         ("observation_tolerance_m", Range::POSITIVE),
         ("observation_changed_area_mm2", Range::POSITIVE),
         ("collision_margin_m", Range::Float(0.0, 0.2)),
@@ -185,6 +195,7 @@ impl Parameters for SuctionExecutorParameters {
         ("contact.press_m", Range::Float(0.0, 0.01)),
         ("driver.suction_pin", PIN),
         ("driver.vacuum_pin", PIN),
+        ("driver.enable_pin", Range::Integer(-1, 17)),
         ("driver.status_max_age_s", TIME),
         ("driver.reading_timeout_s", TIME),
         ("driver.rest_speed_rad_s", Range::POSITIVE),
@@ -201,23 +212,55 @@ impl Parameters for SuctionExecutorParameters {
         ("driver.call_timeout_s", TIME),
         ("driver.call_attempts", Range::Integer(1, 100)),
     ];
-    // What protects people is not for the network to change, whether or not the node is configured.
-    const FIXED: &'static [&'static str] = &["require_approval", "require_presence", "stop_file"];
-    const CHANGEABLE: &'static [&'static str] = &[
+    // What may move, on which view and on whose word, how fast, and what stops it: not for the network to change, whether or not the node is
+    // configured. The test below says of each other parameter why it may be set.
+    const FIXED: &'static [&'static str] = &[
+        "require_approval",
+        "sure_probability",
+        "operators",
+        "require_presence",
+        "presence_timeout_s",
+        "stop_file",
+        "urdf",
+        "arm_calibration",
         "limits.clearance_m",
         "limits.lift_m",
         "limits.travel_m_s",
         "limits.carry_m_s",
         "limits.descend_m_s",
         "limits.acceleration_m_s2",
+        "joints.acceleration_rad_s2",
+        "joints.jerk_rad_s3",
+        "joints.hose_turn_rad",
         "observation_tolerance_m",
         "observation_changed_area_mm2",
+        "observation_max_age_s",
+        "observation_needs_home",
+        "collision_margin_m",
         "confirmation_grace_s",
+        "contact.slow_from_m",
+        "contact.slow_m_s",
+        "contact.window_m",
+        "contact.press_m",
+        "driver.enable_pin",
+        "driver.status_max_age_s",
+        "driver.rest_speed_rad_s",
+        "driver.rest_time_s",
+        "driver.path_tolerance_rad",
+        "driver.goal_tolerance_rad",
+        "driver.motion_time_factor",
+        "driver.motion_time_margin_s",
+        "driver.lag_rule",
+        "driver.contact",
+        "driver.check_controllers",
+        "driver.stop_timeout_s",
     ];
 }
 
 #[cfg(test)]
 mod tests {
+    use std::path::Path;
+
     use super::*;
 
     #[test]
@@ -231,6 +274,76 @@ mod tests {
     fn approval_is_required_unless_switched_off() {
         let parameters = SuctionExecutorParameters::default();
         assert_eq!(parameters.require_approval(), RequireApproval::Always);
+    }
+
+    /// What may be set while the node is unconfigured, and nothing moves: names of others' interfaces, wiring, and how long answers of
+    /// others are waited for, after which nothing moves.
+    const WIRING: &[&str] = &[
+        "world_frame",
+        "driver.follow_action",
+        "driver.until_action",
+        "driver.io_and_status",
+        "driver.suction_pin",
+        "driver.vacuum_pin",
+        "driver.blow_off_pin",
+        "driver.controller_manager",
+        "driver.reading_timeout_s",
+        "driver.grasp_wait_s",
+        "driver.release_wait_s",
+        "driver.answer_timeout_s",
+        "driver.call_timeout_s",
+        "driver.call_attempts",
+    ];
+
+    /// Dotted names of all parameters.
+    fn names(value: &serde_yaml_ng::Value, prefix: &str) -> Vec<String> {
+        let Some(mapping) = value.as_mapping() else {
+            return vec![prefix.to_owned()];
+        };
+        let name = |key: &serde_yaml_ng::Value| {
+            let dot = if prefix.is_empty() { "" } else { "." };
+            format!("{prefix}{dot}{}", key.as_str().unwrap())
+        };
+        let pairs = mapping.iter();
+        pairs
+            .flat_map(|(key, value)| names(value, &name(key)))
+            .collect()
+    }
+
+    #[test]
+    fn what_weakens_approval_or_safety_cannot_be_set_while_the_process_runs() {
+        type Given = SuctionExecutorParameters;
+        let all = names(&serde_yaml_ng::to_value(Given::default()).unwrap(), "");
+        let mut decided: Vec<&str> = Given::FIXED.iter().chain(WIRING).copied().collect();
+        for name in &all {
+            assert!(
+                decided.contains(&name.as_str()),
+                "{name}: is it fixed, or wiring?"
+            );
+        }
+        decided.sort_unstable();
+        decided.dedup();
+        assert_eq!(decided.len(), all.len());
+        assert_eq!(Given::CHANGEABLE, [""; 0]);
+    }
+
+    #[test]
+    fn the_parameters_of_a_real_cell_are_valid_and_stricter_than_the_defaults() {
+        let text = std::fs::read_to_string(
+            Path::new(env!("CARGO_MANIFEST_DIR")).join("../../config/real_cell.yaml"),
+        )
+        .unwrap();
+        let read: SuctionExecutorParameters =
+            node_kit::load_text("real_cell.yaml", &text, "/suction_executor").unwrap();
+        let default = SuctionExecutorParameters::default();
+        assert!(read.observation_needs_home);
+        assert!(read.observation_max_age_s < default.observation_max_age_s);
+        assert!(read.driver.status_max_age_s < default.driver.status_max_age_s);
+        assert!(read.joints.acceleration_rad_s2 < default.joints.acceleration_rad_s2);
+        assert!(read.joints.jerk_rad_s3 < default.joints.jerk_rad_s3);
+        assert!(read.joints.hose_turn_rad > 0.0);
+        assert!(read.contact.slow_from_m > 0.0);
+        assert_eq!(read.require_approval, Approval::Always);
     }
 
     #[test]

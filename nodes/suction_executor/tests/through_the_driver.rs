@@ -9,7 +9,8 @@ use heightmap::{Camera, Fusion, Heightmap, View, Workspace};
 use msgs::convert;
 use msgs::diagnostic_msgs::DiagnosticArray;
 use msgs::sctn_msgs::{
-    self, OperatorPresence, ProposeHome, ProposeHomeRequest, Reward, StepConfirmation, StepResult,
+    self, OperatorPresence, PlannedMotion, ProposeHome, ProposeHomeRequest, Reward,
+    StepConfirmation, StepResult,
 };
 use msgs::sensor_msgs::{CameraInfo, Image, JointState};
 use msgs::tf2_msgs::TFMessage;
@@ -381,9 +382,9 @@ async fn episode(problem: &str) -> Environment {
         let action = match environment.demonstrate() {
             _ if environment.is_done() => break,
             None => break,
-            // Nothing to pick there: what fails, fails alike.
+            // Nothing to pick there, and nothing in the way: what fails, fails alike.
             Some(_) if id == 3 => PickPlace {
-                pick: Isometry2::new(Vector2::new(0.3, -0.45), 0.0),
+                pick: Isometry2::new(Vector2::new(0.3, 0.3), 0.0),
                 place: Isometry2::new(Vector2::new(0.6, 0.45), 1.0),
             },
             Some(action) => action,
@@ -692,5 +693,180 @@ async fn with_require_presence_nothing_moves_unattended_and_a_motion_stops_when_
     let stopped = bench.joints().await;
     let home = environment.cell().work_cell().arm.home;
     assert!(stopped.position != home.iter().copied().collect::<Vec<_>>());
+    bench.stop().await;
+}
+
+/// Largest acceleration (rad/s^2) and jerk (rad/s^3) of a joint in a planned motion, each part of which begins and ends at rest.
+fn planned_peaks(motion: &PlannedMotion) -> (f64, f64) {
+    let points = &motion.trajectory.points;
+    assert!(points.len() > 2, "{}", motion.reason);
+    let time_s = |index: usize| {
+        let time = convert::duration_from_msg(&points[index].time_from_start).unwrap();
+        time.as_secs_f64()
+    };
+    let rests = |index: usize| points[index].velocities.iter().all(|speed| *speed == 0.0);
+    let (mut most, mut most_jerk) = (0.0f64, 0.0f64);
+    let mut before: Option<Vec<f64>> = None;
+    for index in 1..points.len() {
+        let step_s = time_s(index) - time_s(index - 1);
+        let pairs = points[index]
+            .velocities
+            .iter()
+            .zip(&points[index - 1].velocities);
+        let now: Vec<f64> = pairs
+            .map(|(after, before)| (after - before) / step_s)
+            .collect();
+        most = now.iter().fold(most, |most, one| most.max(one.abs()));
+        if let Some(before) = before.take() {
+            let jerks = now
+                .iter()
+                .zip(&before)
+                .map(|(now, before)| (now - before).abs() / step_s);
+            most_jerk = jerks.fold(most_jerk, f64::max);
+        }
+        before = (!rests(index)).then_some(now);
+    }
+    (most, most_jerk)
+}
+
+/// Largest acceleration (rad/s^2) of a joint in what the arm does until a result is said.
+async fn moved_until_result(bench: &mut Bench) -> (StepResult, f64) {
+    let mut states: Vec<JointState> = Vec::new();
+    let result = loop {
+        tokio::select! {
+            state = bench.joint_states.recv() => states.push(state),
+            result = bench.results.recv() => break result,
+        }
+    };
+    let time_s = |state: &JointState| {
+        convert::time_from_msg(&state.header.stamp)
+            .unwrap()
+            .as_secs_f64()
+    };
+    let mut most = 0.0f64;
+    for pair in states.windows(2) {
+        let step_s = time_s(&pair[1]) - time_s(&pair[0]);
+        if step_s <= 0.0 {
+            continue;
+        }
+        for (after, before) in pair[1].velocity.iter().zip(&pair[0].velocity) {
+            most = most.max((after - before).abs() / step_s);
+        }
+    }
+    (result, most)
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn every_planned_motion_keeps_to_the_limits_of_the_joints_and_so_does_the_arm() {
+    const ACCELERATION_RAD_S2: f64 = 0.5;
+    const JERK_RAD_S3: f64 = 4.0;
+    let limits = [
+        (
+            "joints.acceleration_rad_s2",
+            ACCELERATION_RAD_S2.to_string(),
+        ),
+        ("joints.jerk_rad_s3", JERK_RAD_S3.to_string()),
+    ];
+    // Without limits as with them: the limits are what makes the difference.
+    for (limits, keeps) in [(&[][..], false), (&limits[..], true)] {
+        let (mut bench, ..) = proposed(&slow(), limits).await;
+        let mut planned = bench
+            .node
+            .subscription::<PlannedMotion>("planned_motion", Qos::Latched)
+            .unwrap();
+        let of_proposal = within(
+            "planned motion",
+            newest(&mut planned, |m| m.proposal_id == 1),
+        )
+        .await;
+        bench.decide(1, StepConfirmation::APPROVE);
+        bench.until_moving().await;
+        tokio::time::sleep(Duration::from_secs(1)).await;
+        bench.decide(1, StepConfirmation::STOP);
+        bench.ended(1, StepResult::STOPPED).await;
+        let client = bench
+            .node
+            .service_client::<ProposeHome>("/suction_executor/propose_home")
+            .unwrap();
+        client.wait_for_server(PATIENCE).await.unwrap();
+        let patient = CallOptions {
+            attempts: 12,
+            timeout: PATIENCE / 12,
+        };
+        let home = client
+            .call(&ProposeHomeRequest::default(), &patient)
+            .await
+            .unwrap();
+        assert!(home.success, "{}", home.message);
+        let of_home = newest(&mut planned, |m| m.proposal_id == home.proposal_id);
+        let of_home = within("planned way home", of_home).await;
+        while bench.joint_states.try_recv().is_some() {}
+        bench.decide(home.proposal_id, StepConfirmation::APPROVE);
+        let (result, moved) = within("way home", moved_until_result(&mut bench)).await;
+        assert_eq!(result.outcome, StepResult::AT_HOME, "{}", result.reason);
+        for (name, motion) in [("proposal", &of_proposal), ("way home", &of_home)] {
+            let (most, most_jerk) = planned_peaks(motion);
+            println!("{name}, limits {keeps}: {most:.2} rad/s^2, {most_jerk:.1} rad/s^3");
+            assert_eq!(
+                most <= ACCELERATION_RAD_S2 * 1.001,
+                keeps,
+                "{name}: {most} rad/s^2"
+            );
+            assert_eq!(
+                most_jerk <= JERK_RAD_S3 * 1.001,
+                keeps,
+                "{name}: {most_jerk} rad/s^3"
+            );
+        }
+        println!("limits {keeps}: the arm moved with up to {moved:.2} rad/s^2");
+        // Between two points of a trajectory the controller's cubic is a little above the mean.
+        assert_eq!(moved <= 1.2 * ACCELERATION_RAD_S2, keeps, "{moved} rad/s^2");
+        bench.stop().await;
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn the_arm_is_planned_with_its_calibration() {
+    // A UR5 whose joints sit as a factory leaves them.
+    let calibration = "
+kinematics:
+  shoulder: {x: 0, y: 0, z: 0.0893, roll: 0, pitch: 0, yaw: 1.0e-05}
+  upper_arm: {x: 0.0001, y: 0, z: 0, roll: 1.5713, pitch: 0, yaw: 1.1e-06}
+  forearm: {x: -0.4252, y: 0, z: 0, roll: 0.0015, pitch: 0.0004, yaw: 0}
+  wrist_1: {x: -0.3927, y: -0.0004, z: 0.1092, roll: 0.003, pitch: -0.0012, yaw: 0}
+  wrist_2: {x: 0, y: -0.0947, z: 0, roll: 1.5708, pitch: 0, yaw: 0}
+  wrist_3: {x: 0, y: 0.0824, z: 0, roll: 1.5717, pitch: 3.141592653589793, yaw: 3.141592653589793}
+";
+    let folder = tempfile::tempdir().unwrap();
+    let path = folder.path().join("my_robot_calibration.yaml");
+    std::fs::write(&path, calibration).unwrap();
+    let nominal = WorkCell::builtin().unwrap();
+    let calibrated = nominal.clone().with_calibration_file(&path).unwrap();
+    let given = [("arm_calibration", path.display().to_string())];
+    let (bench, ..) = proposed(&[], &given).await;
+    let mut planned = bench
+        .node
+        .subscription::<PlannedMotion>("planned_motion", Qos::Latched)
+        .unwrap();
+    let motion = within(
+        "planned motion",
+        newest(&mut planned, |m| m.proposal_id == 1),
+    )
+    .await;
+    // Where suction goes on the tip stands over the pick, turned by half of the turn.
+    let pick = reference().demonstrate().unwrap().pick.translation.vector;
+    let on = &motion.suction_on;
+    let mut points = motion.trajectory.points.iter();
+    let point = points.find(|point| point.time_from_start == *on).unwrap();
+    let mut joints = ur5::Joints::zeros();
+    joints.copy_from_slice(&point.positions);
+    let off_m = |cell: &WorkCell| (cell.arm.tip(&joints).translation.vector.xy() - pick).norm();
+    println!(
+        "off by {:.6} m, by the drawing {:.6} m",
+        off_m(&calibrated),
+        off_m(&nominal)
+    );
+    assert!(off_m(&calibrated) < 1e-5, "{} m", off_m(&calibrated));
+    assert!(off_m(&nominal) > 3e-4, "{} m", off_m(&nominal));
     bench.stop().await;
 }

@@ -64,6 +64,7 @@ class Camera:
         position_m: Sequence[float],
         orientation_xyzw: Sequence[float],
         distortion: Sequence[float] = ...,
+        distortion_model: str = ...,
     ) -> Camera: ...
     @staticmethod
     def ravens() -> list[Camera]: ...

@@ -407,7 +407,7 @@ impl Recorder {
                     _ = listening.changed() => return,
                 };
                 let now = match &clock {
-                    Some(clock) => Duration::from_nanos(clock.now_ns().max(0) as u64),
+                    Some(clock) => clock.time(),
                     None => SystemTime::now()
                         .duration_since(UNIX_EPOCH)
                         .unwrap_or_default(),

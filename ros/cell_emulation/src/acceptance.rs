@@ -108,6 +108,12 @@ impl Acceptance {
         }
     }
 
+    /// Why the goal under way ends: the controller that carries it out was deactivated.
+    pub fn lost_controller(&self) -> Option<String> {
+        let active = self.state.controllers().is_active(&self.controller);
+        (!active).then(|| format!("{} was deactivated", self.controller))
+    }
+
     /// Why a controller takes no goals.
     fn inactive(&self, controller: &str, fault: Fault) -> Option<String> {
         if !fault.modes().program_running {

@@ -8,7 +8,7 @@ use msgs::geometry_msgs::TransformStamped;
 use msgs::sensor_msgs::{CameraInfo, Image};
 use msgs::tf2_msgs::TFMessage;
 use multiravens::render::RgbdImage;
-use node_kit::{Node, NodeError, Publisher, Qos};
+use node_kit::{Graph, Node, NodeError, Publisher, Qos};
 use ur5::{Joints, WorkCell};
 
 /// One capture of one camera.
@@ -46,6 +46,12 @@ impl CameraTopics {
             depth: node.publisher(&format!("{name}/depth/image_rect_raw"), Qos::Image)?,
             info: node.publisher(&format!("{name}/color/camera_info"), Qos::Event)?,
         })
+    }
+
+    /// Whether somebody subscribes to its images.
+    pub fn is_watched(&self, graph: &Graph) -> bool {
+        let topics = [self.color.topic(), self.depth.topic()];
+        topics.iter().any(|topic| graph.subscriptions(topic) > 0)
     }
 
     /// Publishes one capture.

@@ -3,7 +3,7 @@
 use std::convert::Infallible;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
-use driver_model::{Controllers, HardwareSettings};
+use driver_model::{CONTACT_SINCE, Controllers, HardwareSettings};
 use msgs::control_msgs::FollowJointTrajectory;
 use msgs::controller_manager_msgs::{
     ControllerState, ListControllers, ListControllersResponse, SwitchController,
@@ -67,6 +67,15 @@ impl DriverState {
         }
     }
 
+    /// Loads the controllers anew, as the settings have them now.
+    pub fn set_controllers(&self, actions: &ActionNames, hardware: &HardwareSettings) {
+        *self.controllers() = Controllers::new(
+            actions.controller(),
+            &hardware.inactive_controllers,
+            hardware.software_major,
+        );
+    }
+
     /// A dead driver answers nothing, and does not know of what was asked meanwhile when it is started again.
     pub fn set_dead(&self, dead: bool) {
         self.dead.send_replace(dead);
@@ -92,7 +101,8 @@ impl DriverState {
 /// The driver's actions and services on the network.
 pub struct DriverServer {
     follow: ActionServer<FollowJointTrajectory>,
-    until: ActionServer<FollowJointTrajectoryUntil>,
+    /// Nothing on a CB3.
+    until: Option<ActionServer<FollowJointTrajectoryUntil>>,
     set_io: ServiceServer<SetIO>,
     list: ServiceServer<ListControllers>,
     switch: ServiceServer<SwitchController>,
@@ -115,10 +125,15 @@ impl DriverServer {
         state: Arc<DriverState>,
     ) -> Result<Self, NodeError> {
         let follow = node.action_server(&actions.follow)?;
-        let until = node.action_server(&actions.until)?;
+        let until = match hardware.software_major >= CONTACT_SINCE {
+            true => Some(node.action_server(&actions.until)?),
+            false => None,
+        };
         let repeats = hardware.strict_actions.then(|| {
             // rclcpp answers, and throws where it adds the goal to those that it has.
-            until.count_repeats(false);
+            if let Some(until) = &until {
+                until.count_repeats(false);
+            }
             follow.count_repeats(true)
         });
         Ok(Self {
@@ -141,7 +156,7 @@ impl DriverServer {
         loop {
             tokio::select! {
                 goal = self.follow.recv() => pass_on(Request::Follow(Box::new(goal))),
-                goal = self.until.recv() => pass_on(Request::Until(Box::new(goal))),
+                goal = next_goal(&mut self.until) => pass_on(Request::Until(Box::new(goal))),
                 () = repeated(&mut self.repeats) => {
                     error!("a goal id has come twice: the trajectory controller's process is gone");
                     pass_on(Request::Die);
@@ -178,6 +193,16 @@ impl DriverServer {
                 },
             }
         }
+    }
+}
+
+/// Waits for a goal; for ever where the action is not served.
+async fn next_goal(
+    until: &mut Option<ActionServer<FollowJointTrajectoryUntil>>,
+) -> NewGoal<FollowJointTrajectoryUntil> {
+    match until {
+        Some(until) => until.recv().await,
+        None => std::future::pending().await,
     }
 }
 

@@ -12,7 +12,7 @@ use ur5::{Arm, JointTrajectory, Joints};
 pub struct Failure {
     /// An error code of `FollowJointTrajectory`.
     pub code: i32,
-    /// Why.
+    /// The reason.
     pub reason: String,
 }
 

@@ -17,7 +17,9 @@ pub enum ArgumentError {
         example: &'static str,
     },
     /// A flag inside `--ros-args` that we do not know.
-    #[error("unknown ROS argument {0}; expected -r, -p, --params-file, --log-level or --")]
+    #[error(
+        "unknown ROS argument {0}; expected -r, -p, --params-file, --log-level, --enclave or --"
+    )]
     Unknown(String),
 }
 
@@ -57,6 +59,8 @@ pub struct RosArguments {
     pub parameters: Vec<ParameterSource>,
     /// `--log-level`: a level, or `target:=level`.
     pub log_levels: Vec<String>,
+    /// `-e`, `--enclave`: whose files of the keystore the node is protected with, where ROS_SECURITY_ENABLE asks for that.
+    pub enclave: Option<String>,
 }
 
 impl RosArguments {
@@ -106,9 +110,12 @@ impl RosArguments {
                 value("--params-file config/node.yaml")?.into(),
             )),
             "--log-level" => self.log_levels.push(value("--log-level debug")?),
+            "-e" | "--enclave" => {
+                self.enclave = Some(value("--enclave /sctn/suction_executor")?);
+            }
             // Accepted because launch files pass them; they change nothing here.
-            "-e" | "--enclave" | "--log-config-file" | "--log-file-name" => {
-                value("--enclave /")?;
+            "--log-config-file" | "--log-file-name" => {
+                value("--log-file-name node")?;
             }
             "--enable-rosout-logs"
             | "--disable-rosout-logs"
@@ -229,6 +236,13 @@ mod tests {
         assert_eq!(in_cell("goal"), "/far/goal");
         assert_eq!(in_cell("~/state"), "/cell/state");
         assert_eq!(in_cell("~/other"), "/cell/renamed/other");
+    }
+
+    #[test]
+    fn the_enclave_is_the_one_that_was_named_last() {
+        assert_eq!(parse("--ros-args -r a:=b").unwrap().0.enclave, None);
+        let (ros, _) = parse("--ros-args -e /first --enclave /sctn/node").unwrap();
+        assert_eq!(ros.enclave.as_deref(), Some("/sctn/node"));
     }
 
     #[test]

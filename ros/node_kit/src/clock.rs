@@ -5,7 +5,7 @@ use std::{
         Arc,
         atomic::{AtomicI64, Ordering::Relaxed},
     },
-    time::{SystemTime, UNIX_EPOCH},
+    time::{Duration, SystemTime, UNIX_EPOCH},
 };
 
 use msgs::builtin_interfaces;
@@ -39,6 +39,11 @@ impl Clock {
                 .duration_since(UNIX_EPOCH)
                 .map_or(0, |since| since.as_nanos() as i64),
         }
+    }
+
+    /// Time since the epoch; zero before it, and in simulated time before the first `/clock`.
+    pub fn time(&self) -> Duration {
+        Duration::from_nanos(self.now_ns().max(0) as u64)
     }
 
     /// The time as a message stamp.

@@ -6,6 +6,7 @@ use std::{
     fs::{self, File},
     net::{IpAddr, Ipv4Addr, UdpSocket},
     os::unix::fs::MetadataExt as _,
+    path::Path,
     process::{self, ExitCode},
     sync::{
         Mutex, PoisonError,
@@ -16,6 +17,8 @@ use std::{
 
 use anyhow::Context as _;
 use rustdds::DomainParticipantBuilder;
+#[cfg(feature = "security")]
+use rustdds::DomainParticipantSecurityConfigFiles;
 use tokio::task::JoinHandle;
 use tokio_util::sync::CancellationToken;
 use tracing::{Instrument, error, info};
@@ -28,6 +31,7 @@ use crate::{
     parameter_services,
     parameter_store::ParameterStore,
     parameters::{self, Loaded, Parameters},
+    security::{self, Security, SecurityError},
 };
 
 /// Where to look for other nodes.
@@ -52,15 +56,18 @@ pub enum ContextError {
         /// What it may be.
         expected: &'static str,
     },
+    /// Security is asked for, and the node cannot be protected.
+    #[error(transparent)]
+    Security(#[from] SecurityError),
     /// The middleware refused.
     #[error("DDS participant in domain {domain_id}: {reason}")]
     Middleware {
         /// The domain.
         domain_id: u16,
-        /// Why.
+        /// The reason.
         reason: String,
     },
-    /// Somebody is in each of them.
+    /// Every domain id has participants.
     #[error("no ROS domain id from 1 to {LAST_DOMAIN_ID} is unused on this machine")]
     NoUnusedDomain,
 }
@@ -116,12 +123,6 @@ impl Network {
         })
     }
 
-    /// As ROS 2 reads the environment: ROS_DOMAIN_ID, ROS_AUTOMATIC_DISCOVERY_RANGE (SUBNET,
-    /// LOCALHOST, SYSTEM_DEFAULT) and the older ROS_LOCALHOST_ONLY.
-    pub fn from_environment() -> Result<Self, ContextError> {
-        Self::from_variables(|name| env::var(name).ok())
-    }
-
     fn from_variables(read: impl Fn(&str) -> Option<String>) -> Result<Self, ContextError> {
         let bad = |name, value: &str, expected| ContextError::Environment {
             name,
@@ -169,16 +170,34 @@ impl Network {
 #[derive(Clone)]
 pub struct Context {
     network: Network,
+    security: Option<Security>,
     shutdown: CancellationToken,
 }
 
 impl Context {
-    /// Nodes made from this will live on that network.
+    /// Nodes made from this will live on that network, unprotected.
     pub fn new(network: Network) -> Self {
         Self {
             network,
+            security: None,
             shutdown: CancellationToken::new(),
         }
+    }
+
+    /// As ROS 2 reads the environment: ROS_DOMAIN_ID, ROS_AUTOMATIC_DISCOVERY_RANGE (SUBNET, LOCALHOST,
+    /// SYSTEM_DEFAULT), the older ROS_LOCALHOST_ONLY, and the ROS_SECURITY_ENABLE, _STRATEGY, _KEYSTORE and
+    /// _ENCLAVE_OVERRIDE of DDS security.
+    pub fn from_environment() -> Result<Self, ContextError> {
+        Self::from_variables(|name| env::var(name).ok())
+    }
+
+    /// The same, with variables that `read` gives in place of the environment's.
+    pub fn from_variables(read: impl Fn(&str) -> Option<String>) -> Result<Self, ContextError> {
+        Ok(Self {
+            network: Network::from_variables(&read)?,
+            security: Security::from_variables(&read)?,
+            shutdown: CancellationToken::new(),
+        })
     }
 
     /// Makes a node without lifecycle and reads its parameters.
@@ -202,7 +221,7 @@ impl Context {
         let full_name = format!("/{namespace}/{name}").replace("//", "/");
         let loaded = parameters::load::<P>(&arguments.parameters, default_name, &full_name)?;
         let node = Node::new(
-            self.network.join()?,
+            self.join(arguments.enclave.as_deref())?,
             self.shutdown.child_token(),
             default_name,
             arguments,
@@ -246,34 +265,56 @@ impl Context {
         Ok(tokio::spawn(life.instrument(span)))
     }
 
-    /// Cancelled when all nodes of this context are to end.
-    pub fn shutdown_token(&self) -> &CancellationToken {
-        &self.shutdown
-    }
-
     /// Ends all nodes of this context.
     pub fn shutdown(&self) {
         self.shutdown.cancel();
     }
 }
 
-impl Network {
+impl Context {
     /// A new participant of the domain.
-    fn join(self) -> Result<ros2_client::Context, ContextError> {
-        let middleware = |reason: String| ContextError::Middleware {
-            domain_id: self.domain_id,
-            reason,
-        };
-        let mut builder = DomainParticipantBuilder::new(self.domain_id);
-        if self.localhost_only {
+    fn join(&self, enclave: Option<&str>) -> Result<ros2_client::Context, ContextError> {
+        let Network {
+            domain_id,
+            localhost_only,
+        } = self.network;
+        let middleware = |reason| ContextError::Middleware { domain_id, reason };
+        let mut builder = DomainParticipantBuilder::new(domain_id);
+        if localhost_only {
             builder = builder.with_only_networks([IpAddr::V4(Ipv4Addr::LOCALHOST)]);
+        }
+        let folder = match &self.security {
+            Some(security) => security.enclave(enclave)?,
+            None => None,
+        };
+        if let Some(folder) = folder {
+            security::check_supported(&folder)?;
+            builder = protected(builder, &folder)?;
         }
         let participant = builder
             .build()
-            .map_err(|error| middleware(format!("{error:?}")))?;
+            .map_err(|error| middleware(error.to_string()))?;
         ros2_client::Context::from_domain_participant(participant)
             .map_err(|error| middleware(error.to_string()))
     }
+}
+
+/// With the files of that folder.
+#[cfg(feature = "security")]
+fn protected(
+    builder: DomainParticipantBuilder,
+    folder: &Path,
+) -> Result<DomainParticipantBuilder, ContextError> {
+    let files = DomainParticipantSecurityConfigFiles::with_ros_default_names(folder, String::new());
+    Ok(builder.builtin_security(files))
+}
+
+#[cfg(not(feature = "security"))]
+fn protected(
+    _: DomainParticipantBuilder,
+    _: &Path,
+) -> Result<DomainParticipantBuilder, ContextError> {
+    Err(SecurityError::NotBuilt.into())
 }
 
 /// The `main` of a node's own executable: ROS arguments, participant, node, and a clean end on
@@ -317,17 +358,16 @@ where
         }
         Some(other) => anyhow::bail!(
             "unknown argument {other:?}; usage: {default_name} [--parameters] [--ros-args -r FROM:=TO \
-             -p NAME:=VALUE --params-file FILE --log-level LEVEL]"
+             -p NAME:=VALUE --params-file FILE --log-level LEVEL --enclave ENCLAVE]"
         ),
     }
     logging::init(&arguments.log_levels)?;
-    let network = Network::from_environment()?;
+    let context = Context::from_environment()?;
     let runtime = tokio::runtime::Builder::new_multi_thread()
         .enable_all()
         .build()
         .context("tokio runtime")?;
     let result = runtime.block_on(async {
-        let context = Context::new(network);
         let ended = context.start(default_name, &arguments, configure)?;
         let signalled = tokio::spawn({
             let context = context.clone();

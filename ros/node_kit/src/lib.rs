@@ -23,6 +23,7 @@ mod qos;
 mod qos_overrides;
 mod raw;
 mod reply_cache;
+mod security;
 mod service;
 mod statistics;
 mod task_group;
@@ -39,7 +40,8 @@ pub use invalid_parameter::InvalidParameter;
 pub use lifecycle::{Active, LifecycleClient, LifecycleError, State, Transition};
 pub use node::{Node, NodeError};
 pub use parameters::{
-    Loaded, NoParameters, ParameterError, Parameters, Range, load_text, mistakes_in_documentation,
+    Loaded, NoParameters, ParameterError, Parameters, Range, load as load_parameters, load_text,
+    mistakes_in_documentation,
 };
 pub use plain::plain_node;
 pub use qos::Qos;
@@ -48,6 +50,7 @@ pub use raw::{
     AsBytes, NoCdr, Offer, PublisherId, RawMessage, RawPublisher, RawQos, RawSubscription,
 };
 pub use reply_cache::ReplyCache;
+pub use security::SecurityError;
 pub use service::{CallError, CallOptions, RequestId, ServiceClient, ServiceServer};
 pub use statistics::{Snapshot, Statistics};
 pub use task_group::TaskGroup;

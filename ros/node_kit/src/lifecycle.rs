@@ -33,7 +33,7 @@ use crate::{
 };
 
 /// How long a node that waits for the end of its work may take to tidy up.
-const GRACE: Duration = Duration::from_secs(2);
+const GRACE: Duration = Duration::from_secs(4);
 
 /// Requests that wait for the transition under way.
 const WAITING_REQUESTS: usize = 8;
@@ -54,11 +54,11 @@ pub trait Active: Send + 'static {
 pub enum State {
     /// Only parameters and lifecycle are there.
     Unconfigured = 1,
-    /// Everything is loaded; nothing is heard or said.
+    /// Everything is loaded; no topic is subscribed or published.
     Inactive = 2,
-    /// At work.
+    /// Topics, services and actions work.
     Active = 3,
-    /// Nothing goes on from here but the end of the process.
+    /// The process is about to end.
     Finalized = 4,
     /// On the way.
     Configuring = 10,

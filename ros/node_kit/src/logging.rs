@@ -25,9 +25,9 @@ use crate::clock::Clock;
 /// The span of each node, with its full name as field `node`.
 const SPAN: &str = "node";
 
-/// RustDDS logs an error for every endpoint of a node that ends, which is none: of its errors only those of
-/// its two threads are said, without which a node would be deaf, and not those of what has been discovered:
-/// ros2-client reads `/clock` with another type. A receive buffer that is too small is said too. RUST_LOG=rustdds=warn shows all.
+/// RustDDS logs harmless errors for every endpoint of a node that ends, and for types that it discovers (ros2-client reads `/clock`
+/// with another type). By default only the errors of its two threads are shown, because a node without them receives nothing, and
+/// the warning of a receive buffer that is too small. RUST_LOG=rustdds=warn shows all.
 const DEFAULT_FILTER: &str = "info,rustdds=off,rustdds::receive_buffer=warn,rustdds::rtps::dp_event_loop=error,rustdds::discovery=error,\
     rustdds::discovery::discovery_db=off,ros2_client=error";
 

@@ -64,7 +64,7 @@ pub enum NodeError {
         what: &'static str,
         /// Its name.
         name: String,
-        /// Why.
+        /// The reason.
         reason: String,
     },
 }

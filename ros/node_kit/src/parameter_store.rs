@@ -117,7 +117,7 @@ impl ParameterStore {
         })
     }
 
-    /// Always the newest parameters; nothing where they are of another type.
+    /// Always the newest parameters; `None` where they are of another type.
     pub(crate) fn newest<P: Parameters>(&self) -> Option<watch::Receiver<P>> {
         self.newest.downcast_ref().cloned()
     }

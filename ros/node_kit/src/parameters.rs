@@ -124,7 +124,7 @@ pub enum ParameterError {
     File {
         /// The file.
         path: PathBuf,
-        /// Why.
+        /// The reason.
         source: std::io::Error,
     },
     /// A parameter file is not YAML.
@@ -152,7 +152,7 @@ pub enum ParameterError {
         name: String,
         /// File or argument.
         origin: String,
-        /// Why.
+        /// The reason.
         reason: String,
     },
 }

@@ -59,7 +59,7 @@ pub enum CallError {
     Middleware {
         /// Service or action.
         name: String,
-        /// Why.
+        /// The reason.
         reason: String,
     },
     /// The action server does not want this goal.

@@ -1,4 +1,4 @@
-//! The executor's heartbeat: the watchdog hears that this process lives while a motion is under way, other executors that there is one.
+//! The executor's heartbeat: the watchdog hears that this process lives while a motion is under way.
 
 use std::time::Duration;
 
@@ -13,79 +13,44 @@ use crate::planted::{Planted, is_planted};
 const TOPIC: &str = "motion_heartbeat";
 /// How often the watchdog hears that a motion is under way.
 const PERIOD: Duration = Duration::from_millis(50);
-/// How often other executors hear that this one is active.
-const IDLE_PERIOD: Duration = Duration::from_millis(200);
-/// How long others are listened for before this executor becomes active, and how many heartbeats of theirs it takes.
-const LISTENING: Duration = Duration::from_millis(700);
-const HEARTBEATS_OF_ANOTHER: usize = 2;
-
-/// What the heartbeat says.
-#[derive(Clone, Copy, Debug, Default)]
-struct Beating {
-    /// Whether this executor may move the arm.
-    active: bool,
-    /// How many motions are under way, goals that are not answered yet included.
-    moving: usize,
-}
 
 /// Says on a topic what this executor is at.
 pub struct Heartbeat {
-    beating: watch::Sender<Beating>,
+    /// How many motions are under way, goals that are not answered yet included.
+    moving: watch::Sender<usize>,
     /// Whether the last heartbeat said that a motion is under way.
     said: watch::Receiver<bool>,
 }
 
 /// A motion is under way until this is dropped.
-pub(crate) struct Moving(watch::Sender<Beating>);
+pub(crate) struct Moving(watch::Sender<usize>);
 
 impl Drop for Moving {
     fn drop(&mut self) {
-        self.0.send_modify(|beating| beating.moving -= 1);
+        self.0.send_modify(|moving| *moving -= 1);
     }
-}
-
-/// The executor is active until this is dropped.
-pub struct ActiveExecutor(watch::Sender<Beating>);
-
-impl Drop for ActiveExecutor {
-    fn drop(&mut self) {
-        self.0.send_modify(|beating| beating.active = false);
-    }
-}
-
-/// Why this executor must not move the arm.
-#[derive(Debug, thiserror::Error)]
-pub enum ActivateError {
-    /// The heartbeat of others cannot be heard.
-    #[error(transparent)]
-    Node(#[from] NodeError),
-    /// One executor for each arm.
-    #[error(
-        "another executor is active: its heartbeat is on {TOPIC}, expected one executor for each arm"
-    )]
-    AnotherIsActive,
 }
 
 impl Heartbeat {
     pub(crate) fn new(node: &Node, tasks: &TaskGroup) -> Result<Self, NodeError> {
-        let beating = watch::Sender::new(Beating::default());
+        let moving = watch::Sender::new(0);
         let (saying, said) = watch::channel(false);
         let heartbeats = node.publisher::<Bool>(TOPIC, Qos::Event)?;
-        tasks.spawn(beat(heartbeats, beating.subscribe(), saying));
-        Ok(Self { beating, said })
+        tasks.spawn(beat(heartbeats, moving.subscribe(), saying));
+        Ok(Self { moving, said })
     }
 
     /// A motion begins.
     pub(crate) fn moving(&self) -> Moving {
-        self.beating.send_modify(|beating| beating.moving += 1);
-        Moving(self.beating.clone())
+        self.moving.send_modify(|moving| *moving += 1);
+        Moving(self.moving.clone())
     }
 
     /// Waits until no motion is under way and no goal is unanswered.
     pub(crate) async fn idle(&self) {
-        let mut beating = self.beating.subscribe();
+        let mut moving = self.moving.subscribe();
         // The sender lives as long as this.
-        let _ = beating.wait_for(|beating| beating.moving == 0).await;
+        let _ = moving.wait_for(|moving| *moving == 0).await;
     }
 
     /// The same, and until the watchdog was told so.
@@ -95,47 +60,27 @@ impl Heartbeat {
         // An error: nothing is said any more.
         let _ = said.wait_for(|moving| !moving).await;
     }
-
-    /// Makes this the executor that may move the arm.
-    ///
-    /// # Errors
-    /// Another one is active.
-    pub async fn activate(&self, node: &Node) -> Result<ActiveExecutor, ActivateError> {
-        let mut heartbeats = node.subscription::<Bool>(TOPIC, Qos::Event)?;
-        let listening = async {
-            for _ in 0..HEARTBEATS_OF_ANOTHER {
-                heartbeats.recv().await;
-            }
-        };
-        if timeout(LISTENING, listening).await.is_ok() && !is_planted(Planted::SecondExecutor) {
-            return Err(ActivateError::AnotherIsActive);
-        }
-        self.beating.send_modify(|beating| beating.active = true);
-        Ok(ActiveExecutor(self.beating.clone()))
-    }
 }
 
 async fn beat(
     heartbeats: Publisher<Bool>,
-    mut beating: watch::Receiver<Beating>,
+    mut moving: watch::Receiver<usize>,
     saying: watch::Sender<bool>,
 ) {
     let mut silent = true;
     loop {
-        let Beating { active, moving } = *beating.borrow_and_update();
-        let is_moving = moving > 0;
+        let is_moving = *moving.borrow_and_update() > 0;
         // Once more after the last motion.
-        if (is_moving || active || !silent) && !is_planted(Planted::NoHeartbeat) {
+        if (is_moving || !silent) && !is_planted(Planted::NoHeartbeat) {
             heartbeats.publish(Bool { data: is_moving });
         }
         saying.send_replace(is_moving);
-        silent = !(is_moving || active);
-        let pause = match (is_moving, active) {
-            (true, _) => PERIOD,
-            (false, true) => IDLE_PERIOD,
-            (false, false) => Duration::MAX,
+        silent = !is_moving;
+        let pause = match is_moving {
+            true => PERIOD,
+            false => Duration::MAX,
         };
-        if let Ok(Err(_)) = timeout(pause, beating.changed()).await {
+        if let Ok(Err(_)) = timeout(pause, moving.changed()).await {
             return;
         }
     }

@@ -1,5 +1,7 @@
 #![doc = include_str!("../README.md")]
 
+mod claim;
+mod exclusion;
 mod heartbeat;
 mod motion;
 mod parameters;
@@ -12,6 +14,7 @@ mod streams;
 mod tests;
 
 use std::sync::Arc;
+use std::sync::atomic::AtomicBool;
 use std::time::{Duration, Instant};
 
 use msgs::control_msgs::{FollowJointTrajectory, JointTolerance};
@@ -21,18 +24,21 @@ use node_kit::{ActionClient, CallOptions, Clock, Node, NodeError, ServiceClient,
 use tokio::sync::watch;
 use ur5::{JointTrajectory, WorkCell};
 
+use self::exclusion::Exclusion;
 use self::readiness::{Readiness, watch_readiness};
 use self::status::DriverStatus;
 use self::streams::follow_status;
 
-pub use self::heartbeat::{ActivateError, ActiveExecutor, Heartbeat};
-pub use self::parameters::{ContactSign, DriverParameters};
+pub use self::exclusion::{ActivateError, ActiveExecutor};
+pub use self::heartbeat::Heartbeat;
+pub use self::parameters::DriverParameters;
+pub use self::readiness::driver_obstacle;
 pub use self::robot::DriverRobot;
 
 /// Why the robot does not go on. Suction stays as it is: holding is safer than dropping.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
 pub enum DriverError {
-    /// The motion was stopped; whoever stopped it knows why.
+    /// The motion was stopped: whoever stopped it knows why; or the enabling input was low.
     #[error("stopped")]
     Stopped,
     /// The driver failed, stopped by itself, or was lost.
@@ -54,11 +60,14 @@ pub struct DriverClient {
     readiness: watch::Receiver<Readiness>,
     /// The newest status of the driver.
     pub status: watch::Receiver<DriverStatus>,
-    /// What the watchdog and other executors hear.
+    /// What the watchdog hears.
     pub heartbeat: Heartbeat,
+    exclusion: Exclusion,
     parameters: DriverParameters,
     joint_names: [String; 6],
     clock: Clock,
+    /// Whether it was told that the driver answers late.
+    is_late: AtomicBool,
     /// Origin of the times of arrival in the status.
     pub origin: Instant,
     /// They go on until a motion under way is stopped, whatever becomes of the node.
@@ -84,12 +93,22 @@ impl DriverClient {
             readiness: watch_readiness(node, parameters)?,
             status: follow_status(node, &tasks, parameters, work_cell, origin)?,
             heartbeat: Heartbeat::new(node, &tasks)?,
+            exclusion: Exclusion::new(node)?,
             parameters: parameters.clone(),
             joint_names: work_cell.joint_names.clone(),
             clock: node.clock().clone(),
+            is_late: AtomicBool::new(false),
             origin,
             tasks,
         })
+    }
+
+    /// Makes this the executor that may move the arm.
+    ///
+    /// # Errors
+    /// Another one is active.
+    pub async fn activate(&self, node: &Node) -> Result<ActiveExecutor, ActivateError> {
+        self.exclusion.activate(node).await
     }
 
     fn options(&self) -> CallOptions {
@@ -105,6 +124,11 @@ impl DriverClient {
             Readiness::Refused(reason) => Some(reason.clone()),
             Readiness::Ready | Readiness::Unchecked(_) => None,
         }
+    }
+
+    /// Whether the enabling input is low, or has been since a time.
+    pub fn is_disabled_since(&self, since: Duration) -> bool {
+        self.status.borrow().is_disabled_since(since)
     }
 
     /// Why the arm must not move now, if there is a reason.

@@ -4,23 +4,27 @@
 
 use std::future::Future;
 use std::sync::Arc;
+use std::sync::atomic::Ordering;
 use std::time::{Duration, Instant};
 
 use msgs::Action;
 use node_kit::{ActionClient, CallError, CallOptions, GoalStatus, SentGoal};
+use pick_place::ContactSign;
 use tokio::sync::oneshot;
 use tokio::time::{MissedTickBehavior, interval, sleep, timeout};
 use tokio_util::sync::CancellationToken;
 use tracing::{debug, info, warn};
 
 use crate::planted::{Planted, is_planted};
-use crate::{ContactSign, DriverParameters};
-use crate::{DriverClient, DriverError};
+use crate::{DriverClient, DriverError, DriverParameters};
 
 /// How often a motion is looked after.
 pub(crate) const WATCH_PERIOD: Duration = Duration::from_millis(20);
 /// How long the answer to a cancel is waited for, and the pause before goals are cancelled again while the arm does not come to rest.
 const CANCEL_PERIOD: Duration = Duration::from_millis(200);
+/// A driver that answers later than this has the fault of its issue 1908: `trajectory_until_node` takes 1 to 2 s, and rejects what has
+/// ended by then.
+const PROMPT_ANSWER: Duration = Duration::from_millis(900);
 /// After the time that an action may take to answer, an answer that is still to come is waited for by so much more.
 const LATE_ANSWER: Duration = Duration::from_secs(30);
 
@@ -59,6 +63,13 @@ impl DriverClient {
             Err(error) => return Err(self.break_off(error).await),
         };
         let accepted = begin.elapsed();
+        if accepted > PROMPT_ANSWER && !self.is_late.swap(true, Ordering::Relaxed) {
+            warn!(
+                "{} has taken {:.1} s to accept a goal. UR's driver takes 1 to 2 s before the fix of its issue 1908, and may reject short descents: docs/guide/deploy.md",
+                client.name(),
+                accepted.as_secs_f64()
+            );
+        }
         let ended = tokio::select! {
             end = sent.result() => end.map_err(DriverError::fault),
             trouble = trouble => Err(trouble),
@@ -115,7 +126,15 @@ impl DriverClient {
         if is_planted(Planted::AnswersWithoutCancel) {
             return reason;
         }
-        match self.stop_arm().await {
+        let stopped = self.stop_arm().await;
+        let reason = match (reason, self.status.borrow().safety_stop()) {
+            // The driver tells its modes one by one: the power that is off before the emergency stop that has switched it off.
+            (DriverError::Fault(reason), Some(stop)) if !reason.contains(&stop) => {
+                DriverError::Fault(format!("{stop}; {reason}"))
+            }
+            (reason, _) => reason,
+        };
+        match stopped {
             Ok(()) => {
                 info!("broken off, the arm rests: {reason}");
                 reason
@@ -186,12 +205,16 @@ impl DriverClient {
         let margin = Duration::from_secs_f64(motion_time_margin_s);
         let limit = planned.mul_f64(motion_time_factor) + margin;
         let begin_ns = self.clock.now_ns();
+        let since = self.origin.elapsed();
         let mut ticks = interval(WATCH_PERIOD);
         ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
         loop {
             tokio::select! {
                 () = stop.cancelled() => return DriverError::Stopped,
                 _ = ticks.tick() => {}
+            }
+            if self.is_disabled_since(since) {
+                return DriverError::Stopped;
             }
             if let Some(obstacle) = self.obstacle() {
                 return DriverError::Fault(obstacle);

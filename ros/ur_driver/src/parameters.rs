@@ -1,19 +1,7 @@
 //! Parameters of the driver's edge; the node that uses it documents each in its configuration file.
 
+use pick_place::ContactSign;
 use serde::{Deserialize, Serialize};
-
-/// What tells that the tool touches something.
-#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, Serialize, Deserialize)]
-#[serde(rename_all = "snake_case")]
-pub enum ContactSign {
-    /// The driver's action `trajectory_until_node`: e-Series only.
-    #[default]
-    UntilAction,
-    /// The vacuum sensor, suction being on while the tip comes down.
-    Vacuum,
-    /// Nothing: the end of the way down is taken for the contact.
-    Height,
-}
 
 /// The driver and its wiring.
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
@@ -29,6 +17,8 @@ pub struct DriverParameters {
     pub suction_pin: u8,
     /// Digital input of the vacuum sensor.
     pub vacuum_pin: u8,
+    /// Digital input without which nothing moves: low in a motion is a stop; -1 for none.
+    pub enable_pin: i8,
     /// Wall seconds; nothing moves when joint or pin states are older.
     pub status_max_age_s: f64,
     /// Wall seconds to wait for a fresh state of the joints or pins.
@@ -59,7 +49,7 @@ pub struct DriverParameters {
     pub blow_off_pin: i8,
     /// Namespace of `list_controllers`.
     pub controller_manager: String,
-    /// Whether controllers, the robot's software and the tool's voltage are checked before anything moves.
+    /// Whether controllers, actions, the robot's software and the tool's voltage are checked before anything moves.
     pub check_controllers: bool,
     /// Wall seconds that an action may take to answer a goal.
     pub answer_timeout_s: f64,
@@ -79,6 +69,7 @@ impl Default for DriverParameters {
             io_and_status: "io_and_status_controller".into(),
             suction_pin: 16,
             vacuum_pin: 16,
+            enable_pin: -1,
             status_max_age_s: 2.0,
             reading_timeout_s: 5.0,
             rest_speed_rad_s: 1e-3,

@@ -8,6 +8,8 @@ pub enum Planted {
     MovesUnapproved,
     /// The approval of any proposal moves the newest one.
     AnyApproval,
+    /// The approval of somebody who does not decide counts.
+    AnyOperator,
     /// A superseded proposal can still be approved.
     ApprovesSuperseded,
     /// A proposal can still be approved after it was carried out or stopped.
@@ -66,9 +68,10 @@ mod some {
     use super::{NoFault, Planted};
     use std::sync::LazyLock;
 
-    const ALL: [Planted; 13] = [
+    const ALL: [Planted; 14] = [
         Planted::MovesUnapproved,
         Planted::AnyApproval,
+        Planted::AnyOperator,
         Planted::ApprovesSuperseded,
         Planted::ApprovesTwice,
         Planted::IgnoresStop,

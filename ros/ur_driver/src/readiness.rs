@@ -1,14 +1,15 @@
-//! Whether the driver is one that this executor can work with: its controllers, the robot's software, the power of the pins.
+//! Whether the driver is one that this executor can work with: its controllers and actions, the robot's software, the power of the pins.
 
-use std::time::Duration;
+use std::time::{Duration, Instant};
 
 use msgs::controller_manager_msgs::{ControllerState, ListControllers, ListControllersRequest};
 use msgs::ur_msgs::{GetRobotSoftwareVersion, GetRobotSoftwareVersionRequest, ToolDataMsg};
-use node_kit::{CallOptions, Node, NodeError, Qos, ServiceClient, Subscription};
+use node_kit::{CallOptions, Graph, Node, NodeError, Qos, ServiceClient, Subscription};
+use pick_place::ContactSign;
 use tokio::sync::watch;
 use tracing::{info, warn};
 
-use crate::{ContactSign, DriverParameters};
+use crate::DriverParameters;
 
 /// Detects contact for the action that moves until contact.
 const TOOL_CONTACT: &str = "tool_contact_controller";
@@ -19,6 +20,8 @@ const TOOL_PINS_FROM: u8 = 16;
 /// Between checks, before and after the first that found nothing wrong.
 const EAGER: Duration = Duration::from_millis(500);
 const CALM: Duration = Duration::from_secs(5);
+/// Once the driver has answered, its action servers are discovered within this time.
+const DISCOVERY: Duration = Duration::from_secs(5);
 
 /// What the checks of the driver have found.
 #[derive(Clone, Debug, PartialEq, Eq)]
@@ -47,6 +50,11 @@ struct Checks {
     version: ServiceClient<GetRobotSoftwareVersion>,
     tool_data: Subscription<ToolDataMsg>,
     tool_voltage: Option<u8>,
+    /// Parameter and name of the actions whose server was not found yet.
+    actions: Vec<(&'static str, String)>,
+    /// When the driver answered first.
+    answered: Option<Instant>,
+    graph: Graph,
     driver: DriverParameters,
 }
 
@@ -61,12 +69,19 @@ pub(crate) fn watch_readiness(
     }
     let unchecked = Readiness::Unchecked("the driver's controllers are not checked yet".into());
     let (sender, receiver) = watch::channel(unchecked);
+    let mut actions = vec![("driver.follow_action", node.resolve(&driver.follow_action))];
+    if driver.contact == ContactSign::UntilAction {
+        actions.push(("driver.until_action", node.resolve(&driver.until_action)));
+    }
     let mut checks = Checks {
         controllers: node
             .service_client(&format!("{}/list_controllers", driver.controller_manager))?,
         version: node.service_client("ur_configuration_controller/get_robot_software_version")?,
         tool_data: node.subscription(&format!("{}/tool_data", driver.io_and_status), Qos::Event)?,
         tool_voltage: None,
+        actions,
+        answered: None,
+        graph: node.graph(),
         driver: driver.clone(),
     };
     node.spawn(async move {
@@ -76,7 +91,7 @@ pub(crate) fn watch_readiness(
             let silent = matches!(found, Readiness::Unchecked(_));
             if found != before && !(silent && before == Readiness::Ready) {
                 match &found {
-                    Readiness::Ready => info!("the driver has what is needed"),
+                    Readiness::Ready => info!("the driver is ready"),
                     Readiness::Unchecked(reason) | Readiness::Refused(reason) => warn!("{reason}"),
                 }
                 sender.send_replace(found.clone());
@@ -90,6 +105,24 @@ pub(crate) fn watch_readiness(
         }
     });
     Ok(receiver)
+}
+
+/// Asks the driver whether it has what the executor needs: what is missing, by name; nothing where all is there. A driver that does not answer
+/// within `patience` is asked no more.
+///
+/// # Errors
+/// A name in the parameters is not a ROS name, or the middleware refuses.
+pub async fn driver_obstacle(
+    node: &Node,
+    driver: &DriverParameters,
+    patience: Duration,
+) -> Result<Option<String>, NodeError> {
+    let mut readiness = watch_readiness(node, driver)?;
+    let checked = readiness.wait_for(|found| !matches!(found, Readiness::Unchecked(_)));
+    if let Ok(Ok(found)) = tokio::time::timeout(patience, checked).await {
+        return Ok(found.obstacle());
+    }
+    Ok(readiness.borrow().obstacle())
 }
 
 impl Checks {
@@ -130,7 +163,30 @@ impl Checks {
         if let Some(reason) = missing_controller(&self.driver, &controllers) {
             return Readiness::Refused(reason);
         }
+        if let Some(reason) = self.missing_action() {
+            let answered = *self.answered.get_or_insert_with(Instant::now);
+            return match answered.elapsed() > DISCOVERY {
+                true => Readiness::Refused(reason),
+                false => Readiness::Unchecked(reason),
+            };
+        }
         powerless_pin(&self.driver, self.tool_voltage)
+    }
+
+    /// Names an action that nobody serves. What was found once is not looked for again: the streams tell whether the driver lives.
+    fn missing_action(&mut self) -> Option<String> {
+        let graph = &self.graph;
+        self.actions.retain(|(_, name)| !graph.has_action(name));
+        let (parameter, name) = self.actions.first()?;
+        let instead = match *parameter {
+            "driver.until_action" => {
+                ": start the driver's trajectory_until_node, or use driver.contact vacuum or height"
+            }
+            _ => "",
+        };
+        Some(format!(
+            "nobody serves the action {name} ({parameter}){instead}"
+        ))
     }
 }
 
@@ -162,14 +218,25 @@ fn missing_controller(
 
 /// Names a pin at the tool that has no power.
 fn powerless_pin(driver: &DriverParameters, tool_voltage: Option<u8>) -> Readiness {
-    let pins = [driver.suction_pin, driver.vacuum_pin];
-    let Some(pin) = pins.into_iter().find(|pin| *pin >= TOOL_PINS_FROM) else {
+    let pins = [
+        ("driver.suction_pin", Some(driver.suction_pin)),
+        ("driver.vacuum_pin", Some(driver.vacuum_pin)),
+        ("driver.enable_pin", u8::try_from(driver.enable_pin).ok()),
+        (
+            "driver.blow_off_pin",
+            u8::try_from(driver.blow_off_pin).ok(),
+        ),
+    ];
+    let at_tool = pins
+        .into_iter()
+        .find_map(|(name, pin)| Some((name, pin.filter(|pin| *pin >= TOOL_PINS_FROM)?)));
+    let Some((name, pin)) = at_tool else {
         return Readiness::Ready;
     };
     match tool_voltage {
         None => Readiness::Unchecked("no tool_data have arrived".into()),
         Some(0) => Readiness::Refused(format!(
-            "tool_output_voltage is 0 V, expected 12 or 24 V: pin {pin} is at the tool and has no power"
+            "tool_output_voltage is 0 V, expected 12 or 24 V: pin {pin} ({name}) is at the tool and has no power"
         )),
         Some(_) => Readiness::Ready,
     }

@@ -1,5 +1,6 @@
 //! The robot of one primitive: joints, suction, vacuum, and ways along trajectories.
 
+use std::future::Future;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -8,14 +9,13 @@ use msgs::ur_msgs::{
     FollowJointTrajectoryUntilGoal, FollowJointTrajectoryUntilResult, SetIORequest,
 };
 use node_kit::GoalStatus;
-use pick_place::Robot;
+use pick_place::{ContactSign, Robot};
 use tokio::runtime::Handle;
 use tokio::time::{MissedTickBehavior, interval, timeout};
 use tokio_util::sync::CancellationToken;
 use tracing::debug;
 use ur5::{JointTrajectory, Joints};
 
-use crate::ContactSign;
 use crate::motion::WATCH_PERIOD;
 use crate::readiness::Readiness;
 use crate::status::DriverStatus;
@@ -49,7 +49,7 @@ impl DriverRobot {
 
     /// Refuses to go on where it must not.
     fn check(&self) -> Result<(), DriverError> {
-        if self.stop.is_cancelled() {
+        if self.stop.is_cancelled() || self.client.is_disabled_since(self.begun) {
             return Err(DriverError::Stopped);
         }
         if let Some(obstacle) = self.client.obstacle() {
@@ -152,9 +152,33 @@ impl DriverRobot {
         Ok(reading.positions_rad)
     }
 
+    /// Waits until the driver counts as lost.
+    async fn lost(&self) -> DriverError {
+        let max_age = Duration::from_secs_f64(self.client.parameters.status_max_age_s);
+        let mut ticks = interval(WATCH_PERIOD);
+        ticks.set_missed_tick_behavior(MissedTickBehavior::Delay);
+        loop {
+            let now = self.client.origin.elapsed();
+            if let Some(silence) = self.client.status.borrow().silence(now, max_age) {
+                return DriverError::Fault(silence);
+            }
+            ticks.tick().await;
+        }
+    }
+
     /// Switches an output and waits until the driver says that it is switched. A driver that has fallen silent is not asked again: when
     /// it comes back, what it was asked before does not count any more.
     async fn switch_pin(&self, pin: u8, on: bool) -> Result<(), DriverError> {
+        self.switch_pin_unless(pin, on, self.forbidden()).await
+    }
+
+    /// The same, until there is a reason not to go on asking.
+    async fn switch_pin_unless(
+        &self,
+        pin: u8,
+        on: bool,
+        unless: impl Future<Output = DriverError>,
+    ) -> Result<(), DriverError> {
         let request = SetIORequest {
             fun: SetIORequest::FUN_SET_DIGITAL_OUT,
             pin: pin as i8,
@@ -163,7 +187,7 @@ impl DriverRobot {
         let options = self.client.options();
         let response = tokio::select! {
             response = self.client.set_io.call(&request, &options) => response,
-            reason = self.forbidden() => return Err(reason),
+            reason = unless => return Err(reason),
         };
         if !response.map_err(DriverError::fault)?.success {
             let level = if on { "on" } else { "off" };
@@ -189,21 +213,34 @@ impl DriverRobot {
             self.vacuum_within(parameters.grasp_wait_s, true).await?;
             return Ok(());
         }
-        let blow_off = u8::try_from(parameters.blow_off_pin).ok();
-        if let Some(pin) = blow_off {
-            self.switch_pin(pin, true).await?;
-        }
-        let released = self.vacuum_within(parameters.release_wait_s, false).await;
-        if let Some(pin) = blow_off {
-            self.switch_pin(pin, false).await?;
-        }
-        if released? {
+        let released = match u8::try_from(parameters.blow_off_pin) {
+            Ok(pin) => self.blow_off(pin).await?,
+            Err(_) => self.vacuum_within(parameters.release_wait_s, false).await?,
+        };
+        if released {
             return Ok(());
         }
         Err(DriverError::Fault(format!(
             "the vacuum sensor says that something is held {:.1} s after suction was switched off",
             parameters.release_wait_s
         )))
+    }
+
+    /// Blows off until the vacuum sensor says that nothing is held; `false`: it does not in time. Whatever happens meanwhile, a stop too, the output
+    /// is switched off after that.
+    async fn blow_off(&self, pin: u8) -> Result<bool, DriverError> {
+        let limit_s = self.client.parameters.release_wait_s;
+        let released = match self.switch_pin(pin, true).await {
+            Ok(()) => self.vacuum_within(limit_s, false).await,
+            Err(error) => Err(error),
+        };
+        match self.switch_pin_unless(pin, false, self.lost()).await {
+            Ok(()) => released,
+            Err(off) => Err(DriverError::Fault(match released {
+                Ok(_) => format!("pin {pin} may still blow off: {off}"),
+                Err(reason) => format!("{reason}; pin {pin} may still blow off: {off}"),
+            })),
+        }
     }
 
     /// Whether the vacuum sensor says so within a time (s), read after now.

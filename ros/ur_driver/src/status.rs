@@ -18,6 +18,8 @@ pub struct Pins {
     pub suction: bool,
     /// Input of the vacuum sensor.
     pub vacuum: bool,
+    /// Whether the enabling input is low; false where there is none.
+    pub disabled: bool,
 }
 
 /// A state that the driver streams.
@@ -58,6 +60,8 @@ pub struct DriverStatus {
     pub at_home: AtHome,
     /// `io_states`
     pub pins: Option<Newest<Pins>>,
+    /// Arrival of the newest state of the pins in which the enabling input was low.
+    pub disabled_at: Option<Duration>,
 }
 
 /// A run of joint readings at the same place.
@@ -125,6 +129,9 @@ impl DriverStatus {
 
     /// Takes the next state of the pins.
     pub fn read_pins(&mut self, pins: Pins, at: Duration) {
+        if pins.disabled {
+            self.disabled_at = Some(at);
+        }
         self.pins = Some(Newest::next(self.pins.as_ref(), pins, at));
     }
 }
@@ -134,6 +141,13 @@ impl DriverStatus {
     /// of joint and pin states tell whether the driver is alive: neither may be older than
     /// `max_age`.
     pub fn obstacle(&self, now: Duration, max_age: Duration) -> Option<String> {
+        // The safety mode is why: an emergency stop switches the power off, too.
+        if let Some(stop) = self.safety_stop() {
+            return Some(stop);
+        }
+        if self.safety_mode.is_none() {
+            return Some("the driver has not published its safety mode".into());
+        }
         match self.robot_mode {
             Some(RUNNING) => {}
             Some(mode) => {
@@ -143,39 +157,52 @@ impl DriverStatus {
             }
             None => return Some("the driver has not published its robot mode".into()),
         }
-        match self.safety_mode {
-            Some(NORMAL | REDUCED) => {}
-            Some(mode) => {
-                return Some(format!(
-                    "safety mode is {}, expected NORMAL or REDUCED",
-                    safety_mode_name(mode)
-                ));
-            }
-            None => return Some("the driver has not published its safety mode".into()),
-        }
         match self.program_running {
             Some(true) => {}
             Some(false) => return Some("the robot program is not running".into()),
             None => return Some("the driver has not said whether its program runs".into()),
         }
+        let disabled = self.pins.is_some_and(|pins| pins.value.disabled);
+        let disabled = disabled.then(|| "the enabling input is low (driver.enable_pin)".into());
+        self.silence(now, max_age).or(disabled)
+    }
+
+    /// Why the driver counts as lost, if it does: neither joint nor pin states may be older than `max_age`.
+    pub fn silence(&self, now: Duration, max_age: Duration) -> Option<String> {
         let arrivals = [
             ("joint_states", self.joints.map(|joints| joints.at)),
             ("io_states", self.pins.map(|pins| pins.at)),
         ];
-        for (topic, at) in arrivals {
+        arrivals.into_iter().find_map(|(topic, at)| {
             let Some(at) = at else {
                 return Some(format!("no {topic} have arrived"));
             };
             let age = now.saturating_sub(at);
-            if age > max_age {
-                return Some(format!(
+            (age > max_age).then(|| {
+                format!(
                     "the newest {topic} are {:.1} s old, expected at most {:.1} s",
                     age.as_secs_f64(),
                     max_age.as_secs_f64()
-                ));
-            }
+                )
+            })
+        })
+    }
+
+    /// The safety mode, where it is one in which the robot stops.
+    pub fn safety_stop(&self) -> Option<String> {
+        match self.safety_mode? {
+            NORMAL | REDUCED => None,
+            mode => Some(format!(
+                "safety mode is {}, expected NORMAL or REDUCED",
+                safety_mode_name(mode)
+            )),
         }
-        None
+    }
+
+    /// Whether the enabling input is low, or has been since a time.
+    pub fn is_disabled_since(&self, since: Duration) -> bool {
+        self.pins.is_some_and(|pins| pins.value.disabled)
+            || self.disabled_at.is_some_and(|at| at >= since)
     }
 }
 
@@ -221,6 +248,7 @@ mod tests {
             still: None,
             interrupted_at: None,
             at_home: AtHome::default(),
+            disabled_at: None,
             pins: Some(Newest {
                 value: Pins::default(),
                 at: now,
@@ -281,6 +309,15 @@ mod tests {
                 },
                 "PROTECTIVE_STOP",
             ),
+            // An emergency stop, and the power off with it.
+            (
+                DriverStatus {
+                    robot_mode: Some(3),
+                    safety_mode: Some(7),
+                    ..ready.clone()
+                },
+                "ROBOT_EMERGENCY_STOP",
+            ),
             (
                 DriverStatus {
                     safety_mode: Some(99),
@@ -321,6 +358,19 @@ mod tests {
             let reason = status.obstacle(now, AGE).unwrap();
             assert!(reason.contains(expected), "{reason}");
         }
+        let mut disabled = ready.clone();
+        let pins = |disabled| Pins {
+            disabled,
+            ..Pins::default()
+        };
+        disabled.read_pins(pins(true), now);
+        let reason = disabled.obstacle(now, AGE).unwrap();
+        assert!(reason.contains("enable_pin"), "{reason}");
+        // What was low for a moment is remembered.
+        disabled.read_pins(pins(false), now + AGE);
+        assert_eq!(disabled.obstacle(now, AGE), None);
+        assert!(disabled.is_disabled_since(now));
+        assert!(!disabled.is_disabled_since(now + AGE));
         let reduced = DriverStatus {
             safety_mode: Some(REDUCED),
             ..ready

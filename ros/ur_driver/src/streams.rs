@@ -33,6 +33,7 @@ pub(crate) fn follow_status(
     let mut running = node.subscription::<Bool>(&topic("robot_program_running"), Qos::Latched)?;
     let joint_names = work_cell.joint_names.clone();
     let (suction_pin, vacuum_pin) = (driver.suction_pin, driver.vacuum_pin);
+    let enable_pin = u8::try_from(driver.enable_pin).ok();
     let rule = StillRule {
         speed_rad_s: driver.rest_speed_rad_s,
         step_rad: STILL_STEP_RAD,
@@ -52,12 +53,18 @@ pub(crate) fn follow_status(
                 message = io_states.recv() => {
                     let suction = level(&message.digital_out_states, suction_pin);
                     let vacuum = level(&message.digital_in_states, vacuum_pin);
-                    match (suction, vacuum) {
-                        (Some(suction), Some(vacuum)) => sender.send_modify(|status| {
-                            status.read_pins(Pins { suction, vacuum }, origin.elapsed());
+                    let enabled = match enable_pin {
+                        Some(pin) => level(&message.digital_in_states, pin),
+                        None => Some(true),
+                    };
+                    match (suction, vacuum, enabled) {
+                        (Some(suction), Some(vacuum), Some(enabled)) => sender.send_modify(|status| {
+                            let pins = Pins { suction, vacuum, disabled: !enabled };
+                            status.read_pins(pins, origin.elapsed());
                         }),
                         _ => io_states.reject(format_args!(
-                            "expected digital_out_states of pin {suction_pin} and digital_in_states of pin {vacuum_pin}"
+                            "expected digital_out_states of pin {suction_pin} and digital_in_states of pins {vacuum_pin}{}",
+                            enable_pin.map_or_else(String::new, |pin| format!(" and {pin}"))
                         )),
                     }
                 }

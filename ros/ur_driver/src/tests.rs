@@ -6,9 +6,12 @@ use msgs::control_msgs::FollowJointTrajectoryGoal;
 use msgs::rcl_interfaces::{
     Parameter, ParameterType, ParameterValue, SetParameters, SetParametersRequest,
 };
+use msgs::ur_msgs::IOStates;
 use nalgebra::{Isometry2, Vector2};
-use node_kit::{Context, GoalStatus, Network, NoParameters, RosArguments};
-use pick_place::Robot;
+use node_kit::{Context, GoalStatus, Network, NoParameters, Qos, RosArguments, Subscription};
+use pick_place::{
+    ContactSign, ExecuteError, Outcome, PickPlace, PrimitiveSettings, Robot, Touchdown, execute_on,
+};
 use tokio::runtime::Handle;
 use tokio_util::sync::CancellationToken;
 use ur5::{Arm, Joints};
@@ -21,14 +24,26 @@ const PATIENCE: Duration = Duration::from_secs(30);
 struct Bench {
     sim: Context,
     own: Context,
+    /// Lives as long as the bench.
     node: Node,
     client: Arc<DriverClient>,
+    /// Sets parameters of the simulated driver.
+    parameters: ServiceClient<SetParameters>,
     cell: WorkCell,
 }
 
 impl Bench {
     /// `hardware`: parameters of the simulated driver.
     async fn start(hardware: &[(&str, &str)], driver: DriverParameters) -> Self {
+        let bench = Self::start_disabled(hardware, driver).await;
+        bench
+            .until("a ready driver", |bench| bench.client.obstacle().is_none())
+            .await;
+        bench
+    }
+
+    /// The same where the driver may not get ready; its streams are there.
+    async fn start_disabled(hardware: &[(&str, &str)], driver: DriverParameters) -> Self {
         if let Ok(level) = std::env::var("TEST_LOG_LEVEL") {
             // Once for all tests of the process.
             let _ = node_kit::logging::init(&[level]);
@@ -54,15 +69,20 @@ impl Bench {
         let arguments = RosArguments::parse(line).unwrap().0;
         sim.start("sim_workcell", &arguments, sim_workcell::configure)
             .unwrap();
+        let parameters = node.service_client("sim_workcell/set_parameters").unwrap();
         let bench = Self {
             sim,
             own,
             node,
             client: Arc::new(client),
+            parameters,
             cell,
         };
         bench
-            .until("a ready driver", |bench| bench.client.obstacle().is_none())
+            .until("streams of the driver", |bench| {
+                let status = bench.client.status.borrow();
+                status.joints.is_some() && status.pins.is_some()
+            })
             .await;
         bench
     }
@@ -96,8 +116,13 @@ impl Bench {
 
     /// From where the arm is, straight down to below the table, slowly.
     async fn over_the_table(&self) -> JointTrajectory {
+        self.over([0.5, 0.25], -0.01).await
+    }
+
+    /// Goes to 50 mm above the table; returns the way straight down to a height of the tip, slowly.
+    async fn over(&self, [x_m, y_m]: [f64; 2], end_m: f64) -> JointTrajectory {
         let arm = &self.cell.arm;
-        let pose = Isometry2::new(Vector2::new(0.5, 0.25), 0.0);
+        let pose = Isometry2::new(Vector2::new(x_m, y_m), 0.0);
         let above = arm.solve(&Arm::tip_down(&pose, 0.05), &arm.ready).unwrap();
         let there = JointTrajectory::joint_space(arm, &self.joints(), &above).unwrap();
         let moved = self.work(&CancellationToken::new(), move |robot| {
@@ -105,8 +130,46 @@ impl Bench {
         });
         let (reached, joints) = moved.await.unwrap();
         assert_eq!(reached, Ok(true));
-        let end = Arm::tip_down(&pose, -0.01);
+        let end = Arm::tip_down(&pose, end_m);
         JointTrajectory::line(arm, &joints.unwrap(), &end, 0.05, 1.0).unwrap()
+    }
+
+    /// Goes down to the disk, by height, and switches suction on.
+    async fn grip_the_disk(&self) {
+        let descent = self.over(DISK, DISK_HEIGHT_M - 0.003).await;
+        let gripped = self.work(&CancellationToken::new(), move |robot| {
+            let reached = robot.follow(&descent)?;
+            robot.joints()?;
+            robot.set_suction(true)?;
+            Ok::<_, DriverError>(reached && robot.holds()?)
+        });
+        assert_eq!(gripped.await.unwrap(), Ok(true));
+    }
+
+    /// Has something picked and placed, the object being as high as the disk.
+    fn pick_and_place(
+        &self,
+        stop: &CancellationToken,
+        [pick, place]: [[f64; 2]; 2],
+        touchdown: Touchdown,
+    ) -> tokio::task::JoinHandle<Result<Outcome, ExecuteError<DriverError>>> {
+        let pose = |[x_m, y_m]: [f64; 2]| Isometry2::new(Vector2::new(x_m, y_m), 0.0);
+        let action = PickPlace {
+            pick: pose(pick),
+            place: pose(place),
+        };
+        let arm = self.cell.arm.clone();
+        self.work(stop, move |robot| {
+            execute_on(robot, &arm, &action, &LOW, Some(&touchdown), |_| ())
+        })
+    }
+
+    fn pins(&self) -> status::Pins {
+        self.client.status.borrow().pins.unwrap().value
+    }
+
+    fn is_home(&self) -> bool {
+        (self.joints() - self.cell.arm.home).amax() < 1e-2
     }
 
     fn joints(&self) -> Joints {
@@ -131,24 +194,39 @@ impl Bench {
         furthest
     }
 
-    /// Sets a parameter of the simulated driver.
+    /// Sets what is wrong with the robot.
     async fn set_fault(&self, fault: &str) {
-        let client = self
-            .node
-            .service_client::<SetParameters>("sim_workcell/set_parameters")
-            .unwrap();
-        client.wait_for_server(PATIENCE).await.unwrap();
+        let value = ParameterValue {
+            r#type: ParameterType::PARAMETER_STRING,
+            string_value: fault.into(),
+            ..Default::default()
+        };
+        self.set("hardware.fault", value).await;
+    }
+
+    /// Holds the enabling switch or lets it go.
+    async fn enable(&self, enabled: bool) {
+        let value = ParameterValue {
+            r#type: ParameterType::PARAMETER_BOOL,
+            bool_value: enabled,
+            ..Default::default()
+        };
+        self.set("hardware.enabled", value).await;
+    }
+
+    /// Sets a parameter of the simulated driver.
+    async fn set(&self, name: &str, value: ParameterValue) {
+        self.parameters.wait_for_server(PATIENCE).await.unwrap();
         let request = SetParametersRequest {
             parameters: vec![Parameter {
-                name: "hardware.fault".into(),
-                value: ParameterValue {
-                    r#type: ParameterType::PARAMETER_STRING,
-                    string_value: fault.into(),
-                    ..Default::default()
-                },
+                name: name.into(),
+                value,
             }],
         };
-        let answer = client.call(&request, &CallOptions::default()).await;
+        let answer = self
+            .parameters
+            .call(&request, &CallOptions::default())
+            .await;
         assert!(answer.unwrap().results[0].successful);
     }
 }
@@ -158,6 +236,56 @@ impl Drop for Bench {
         self.sim.shutdown();
     }
 }
+
+/// Where a disk of *placing* lies with the seed that the simulated cell begins with, in the world's xy-plane (m).
+const DISK: [f64; 2] = [0.4354, 0.1635];
+const DISK_HEIGHT_M: f64 = 0.012;
+/// Where nothing lies.
+const FREE: [f64; 2] = [0.55, 0.3];
+/// Slow, and no higher than needed.
+const LOW: PrimitiveSettings = PrimitiveSettings {
+    clearance_m: 0.1,
+    lift_m: 0.04,
+    travel_m_s: 0.8,
+    carry_m_s: 0.1,
+    descend_m_s: 0.2,
+    acceleration_m_s2: 2.0,
+};
+
+/// How the disk is picked and put on the table, by such a sign of contact.
+fn onto_the_disk(sign: ContactSign) -> Touchdown {
+    Touchdown {
+        pick_m: DISK_HEIGHT_M,
+        pick_ground_m: 0.0,
+        place_m: 0.0,
+        slow_from_m: 0.03,
+        slow_m_s: 0.05,
+        window_m: 0.015,
+        press_m: match sign {
+            ContactSign::Height => 0.003,
+            ContactSign::UntilAction | ContactSign::Vacuum => 0.0,
+        },
+        senses_pick: sign != ContactSign::Height,
+        senses_place: sign == ContactSign::UntilAction,
+    }
+}
+
+/// A robot that senses contact so, and gives vacuum its time.
+fn sensing(contact: ContactSign) -> DriverParameters {
+    DriverParameters {
+        contact,
+        grasp_wait_s: 1.0,
+        release_wait_s: 1.0,
+        ..DriverParameters::default()
+    }
+}
+
+/// An arm that brakes, with an ejector.
+const EJECTOR: [(&str, &str); 3] = [
+    ("braking_time_s", "0.1"),
+    ("vacuum_build_s", "0.15"),
+    ("vacuum_release_s", "0.1"),
+];
 
 fn reason<T: std::fmt::Debug>(result: Result<T, DriverError>) -> String {
     match result {
@@ -334,7 +462,7 @@ async fn no_motion_begins_before_it_is_known_what_became_of_the_last_goal() {
 async fn every_fault_of_the_robot_ends_a_motion_with_its_name() {
     for (fault, name) in [
         ("protective_stop", "PROTECTIVE_STOP"),
-        ("emergency_stop", "robot mode is 3"),
+        ("emergency_stop", "ROBOT_EMERGENCY_STOP"),
         ("program_stopped", "program is not running"),
         ("driver_dead", "expected at most 0.3 s"),
     ] {
@@ -352,8 +480,8 @@ async fn every_fault_of_the_robot_ends_a_motion_with_its_name() {
             .await;
         bench.set_fault(fault).await;
         let reason = reason(moved.await.unwrap());
-        // The controller's own end of the goal may be heard of first.
-        let ended = reason.contains("the robot has stopped");
+        // The controller's own end of the goal may be heard of first; a safety mode is named all the same.
+        let ended = reason.contains("the robot has stopped") && !name.ends_with("_STOP");
         assert!(reason.contains(name) || ended, "{fault}: {reason}");
         let again = bench.work(&CancellationToken::new(), |robot| robot.set_suction(true));
         let refused = super::tests::reason(again.await.unwrap());
@@ -367,37 +495,60 @@ async fn every_fault_of_the_robot_ends_a_motion_with_its_name() {
 
 #[tokio::test(flavor = "multi_thread")]
 async fn what_the_driver_lacks_is_refused_by_name() {
+    // Suction and vacuum are at the control box.
+    let at_the_box = DriverParameters {
+        suction_pin: 3,
+        vacuum_pin: 4,
+        ..DriverParameters::default()
+    };
+    let unpowered = ("tool_voltage", "0");
     for (hardware, driver, expected) in [
         (
-            (
+            vec![(
                 "inactive_controllers",
                 "[scaled_joint_trajectory_controller]",
-            ),
+            )],
             DriverParameters::default(),
             "scaled_joint_trajectory_controller",
         ),
         (
-            ("inactive_controllers", "[tool_contact_controller]"),
+            vec![("inactive_controllers", "[tool_contact_controller]")],
             DriverParameters::default(),
             "tool_contact_controller",
         ),
         (
-            ("software_major", "3"),
+            vec![("software_major", "3")],
             DriverParameters::default(),
             "software",
         ),
-        (("tool_voltage", "0"), DriverParameters::default(), "pin 16"),
         (
-            ("tool_voltage", "0"),
+            vec![],
             DriverParameters {
-                suction_pin: 3,
-                vacuum_pin: 4,
+                until_action: "nobody/execute".into(),
                 ..DriverParameters::default()
             },
-            "",
+            "nobody serves the action /nobody/execute",
+        ),
+        (vec![unpowered], DriverParameters::default(), "pin 16"),
+        (vec![unpowered], at_the_box.clone(), ""),
+        (
+            vec![unpowered],
+            DriverParameters {
+                blow_off_pin: 17,
+                ..at_the_box.clone()
+            },
+            "pin 17 (driver.blow_off_pin)",
+        ),
+        (
+            vec![unpowered, ("enable_pin", "16")],
+            DriverParameters {
+                enable_pin: 16,
+                ..at_the_box
+            },
+            "pin 16 (driver.enable_pin)",
         ),
     ] {
-        let bench = Bench::start(&[hardware], driver).await;
+        let bench = Bench::start(&hardware, driver).await;
         let checked = |bench: &Bench| match &*bench.client.readiness.borrow() {
             Readiness::Unchecked(_) => None,
             Readiness::Ready => Some(String::new()),
@@ -473,4 +624,279 @@ async fn suction_waits_for_the_vacuum_and_the_release_is_verified() {
     });
     let (took, holds) = gripped.await.unwrap();
     assert!(took >= Duration::from_secs(1) && !holds, "{took:?} {holds}");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn nothing_moves_without_the_enabling_switch_and_letting_it_go_stops_a_motion() {
+    let driver = DriverParameters {
+        enable_pin: 3,
+        ..DriverParameters::default()
+    };
+    let hardware = [
+        ("enable_pin", "3"),
+        ("enabled", "false"),
+        ("braking_time_s", "0.1"),
+    ];
+    let bench = Bench::start_disabled(&hardware, driver).await;
+    let turn = bench.turn(2.0);
+    let same = turn.clone();
+    let moved = bench.work(&CancellationToken::new(), move |robot| robot.follow(&same));
+    assert_eq!(moved.await.unwrap(), Err(DriverError::Stopped));
+    assert!(bench.travel_rad(0.3).await < 1e-3);
+    bench.enable(true).await;
+    bench
+        .until("held switch", |bench| bench.client.obstacle().is_none())
+        .await;
+    let begin = bench.joints();
+    let moved = bench.work(&CancellationToken::new(), move |robot| robot.follow(&turn));
+    bench
+        .until("motion", |bench| (bench.joints() - begin).amax() > 0.2)
+        .await;
+    bench.enable(false).await;
+    assert_eq!(moved.await.unwrap(), Err(DriverError::Stopped));
+    assert!(bench.travel_rad(0.3).await < 1e-3);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_whole_pick_and_place_needs_no_tool_contact_where_vacuum_or_height_is_its_sign() {
+    for (contact, software) in [(ContactSign::Vacuum, "5"), (ContactSign::Height, "3")] {
+        let hardware = [&EJECTOR[..], &[("software_major", software)]].concat();
+        let bench = Bench::start(&hardware, sensing(contact)).await;
+        // What was placed there can be picked there.
+        for way in [[DISK, FREE], [FREE, DISK]] {
+            let stop = CancellationToken::new();
+            let ended = bench.pick_and_place(&stop, way, onto_the_disk(contact));
+            assert_eq!(ended.await.unwrap(), Ok(Outcome::Placed), "{contact:?}");
+            let pins = bench.pins();
+            assert!(bench.is_home() && !pins.suction && !pins.vacuum, "{pins:?}");
+        }
+    }
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn vacuum_that_builds_up_after_the_end_of_the_way_down_is_waited_for() {
+    let hardware = [("braking_time_s", "0.1"), ("vacuum_build_s", "1.5")];
+    let driver = DriverParameters {
+        grasp_wait_s: 3.0,
+        ..sensing(ContactSign::Vacuum)
+    };
+    let bench = Bench::start(&hardware, driver).await;
+    let touchdown = onto_the_disk(ContactSign::Vacuum);
+    let ended = bench.pick_and_place(&CancellationToken::new(), [DISK, FREE], touchdown);
+    assert_eq!(ended.await.unwrap(), Ok(Outcome::Placed));
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_cup_that_meets_nothing_and_gets_no_vacuum_goes_home_with_suction_off() {
+    let bench = Bench::start(&EJECTOR, sensing(ContactSign::Vacuum)).await;
+    // There is nothing as high as that.
+    let touchdown = Touchdown {
+        pick_m: 0.05,
+        ..onto_the_disk(ContactSign::Vacuum)
+    };
+    let ended = bench.pick_and_place(&CancellationToken::new(), [FREE, DISK], touchdown);
+    bench
+        .until("suction on the way down", |bench| bench.pins().suction)
+        .await;
+    assert_eq!(ended.await.unwrap(), Ok(Outcome::NoContact));
+    assert!(bench.is_home());
+    bench
+        .until("suction off", |bench| !bench.pins().suction)
+        .await;
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_stop_on_the_way_down_with_suction_on_keeps_the_arm_where_it_is() {
+    let bench = Bench::start(&EJECTOR, sensing(ContactSign::Vacuum)).await;
+    let descent = bench.over(FREE, -0.01).await;
+    let stop = CancellationToken::new();
+    let begin = bench.joints();
+    let descended = bench.work(&stop, move |robot| robot.follow_until_contact(&descent));
+    bench
+        .until("a descent with suction on", |bench| {
+            bench.pins().suction && (bench.joints() - begin).amax() > 0.01
+        })
+        .await;
+    stop.cancel();
+    assert_eq!(descended.await.unwrap(), Err(DriverError::Stopped));
+    let travel_rad = bench.travel_rad(0.5).await;
+    assert!(travel_rad < 1e-3, "{travel_rad}");
+    // As on every stop suction is as it was.
+    assert!(bench.pins().suction);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn with_something_held_the_end_of_the_way_is_no_contact_and_it_stays_held() {
+    let bench = Bench::start(&EJECTOR, sensing(ContactSign::Vacuum)).await;
+    let descent = bench.over(DISK, -0.003).await;
+    let arm = bench.cell.arm.clone();
+    let done = bench.work(&CancellationToken::new(), move |robot| {
+        let touched = robot.follow_until_contact(&descent)?;
+        let low = robot.joints()?;
+        let mut up = arm.tip(&low);
+        up.translation.z = 0.08;
+        let rise = JointTrajectory::line(&arm, &low, &up, 0.1, 1.0).unwrap();
+        robot.follow(&rise)?;
+        let high = robot.joints()?;
+        up.translation.z = 0.05;
+        let down = JointTrajectory::line(&arm, &high, &up, 0.05, 1.0).unwrap();
+        let again = robot.follow_until_contact(&down)?;
+        let end = robot.joints()?;
+        let off_m = (arm.tip(&end).translation.z - 0.05).abs();
+        Ok::<_, DriverError>((touched, again, off_m, robot.holds()?))
+    });
+    let (touched, again, off_m, holds) = done.await.unwrap().unwrap();
+    assert!(touched && !again && holds && off_m < 1e-3, "{off_m}");
+    assert!(bench.pins().suction);
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn an_object_that_is_lost_in_mid_air_ends_as_dropped_at_home() {
+    let hardware = [
+        ("braking_time_s", "0.1"),
+        ("vacuum_build_s", "0.1"),
+        // Long after the lift, and long before the end of a transfer of 0.4 m at 0.1 m/s.
+        ("vacuum_leak_s", "2.3"),
+    ];
+    let bench = Bench::start(&hardware, sensing(ContactSign::Height)).await;
+    let touchdown = onto_the_disk(ContactSign::Height);
+    let far = [0.5, -0.25];
+    let ended = bench.pick_and_place(&CancellationToken::new(), [DISK, far], touchdown);
+    assert_eq!(ended.await.unwrap(), Ok(Outcome::Dropped));
+    let pins = bench.pins();
+    assert!(bench.is_home() && !pins.suction && !pins.vacuum, "{pins:?}");
+}
+
+/// A part that stays at the cup when suction is off.
+const STICKS: [(&str, &str); 3] = [
+    ("braking_time_s", "0.1"),
+    ("vacuum_build_s", "0.1"),
+    ("vacuum_release_s", "60.0"),
+];
+/// Blows off.
+const BLOW_OFF_PIN: u8 = 4;
+
+/// Whether an output is on in the newest of the states that have arrived, and whether it ever was.
+fn was_on(states: &mut Subscription<IOStates>, pin: u8) -> (bool, bool) {
+    let (mut now, mut ever) = (false, false);
+    while let Some(state) = states.try_recv() {
+        let mut outputs = state.digital_out_states.iter();
+        now = outputs.any(|output| output.pin == pin && output.state);
+        ever |= now;
+    }
+    (now, ever)
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_part_that_sticks_is_a_fault_and_nothing_moves() {
+    let driver = DriverParameters {
+        release_wait_s: 0.5,
+        ..sensing(ContactSign::Height)
+    };
+    let bench = Bench::start(&STICKS, driver).await;
+    bench.grip_the_disk().await;
+    let released = bench.work(&CancellationToken::new(), |robot| robot.set_suction(false));
+    let reason = reason(released.await.unwrap());
+    assert!(
+        reason.contains("something is held 0.5 s after suction was switched off"),
+        "{reason}"
+    );
+    assert!(bench.travel_rad(0.3).await < 1e-3);
+    let pins = bench.pins();
+    assert!(!pins.suction && pins.vacuum, "{pins:?}");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_part_that_sticks_is_blown_off_and_the_output_is_off_again() {
+    let pin = BLOW_OFF_PIN.to_string();
+    let hardware = [&STICKS[..], &[("blow_off_pin", pin.as_str())]].concat();
+    let driver = DriverParameters {
+        blow_off_pin: BLOW_OFF_PIN as i8,
+        ..sensing(ContactSign::Height)
+    };
+    let bench = Bench::start(&hardware, driver).await;
+    let topic = "io_and_status_controller/io_states";
+    let mut states = bench.node.subscription(topic, Qos::Event).unwrap();
+    bench.grip_the_disk().await;
+    assert!(!was_on(&mut states, BLOW_OFF_PIN).1);
+    let released = bench.work(&CancellationToken::new(), |robot| {
+        robot.set_suction(false)?;
+        robot.holds()
+    });
+    assert_eq!(released.await.unwrap(), Ok(false));
+    // One more, sent after the output was switched.
+    tokio::time::sleep(Duration::from_millis(300)).await;
+    assert_eq!(was_on(&mut states, BLOW_OFF_PIN), (false, true));
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_stop_while_a_part_is_blown_off_leaves_the_output_off() {
+    // Nothing blows in truth: the part sticks until the stop comes.
+    let driver = DriverParameters {
+        blow_off_pin: BLOW_OFF_PIN as i8,
+        release_wait_s: 20.0,
+        ..sensing(ContactSign::Height)
+    };
+    let bench = Bench::start(&STICKS, driver).await;
+    let topic = "io_and_status_controller/io_states";
+    let mut states = bench.node.subscription(topic, Qos::Event).unwrap();
+    bench.grip_the_disk().await;
+    let stop = CancellationToken::new();
+    let released = bench.work(&stop, |robot| robot.set_suction(false));
+    let end = Instant::now() + PATIENCE;
+    while !was_on(&mut states, BLOW_OFF_PIN).1 {
+        assert!(Instant::now() < end, "nothing blows off");
+        tokio::time::sleep(Duration::from_millis(10)).await;
+    }
+    let said = Instant::now();
+    stop.cancel();
+    assert_eq!(released.await.unwrap(), Err(DriverError::Stopped));
+    assert!(
+        said.elapsed() < Duration::from_secs(1),
+        "{:?}",
+        said.elapsed()
+    );
+    let _ = was_on(&mut states, BLOW_OFF_PIN);
+    let next = tokio::time::timeout(PATIENCE, states.recv()).await.unwrap();
+    let mut outputs = next.digital_out_states.iter();
+    assert!(outputs.any(|output| output.pin == BLOW_OFF_PIN && !output.state));
+}
+
+/// An executor's edge without a driver.
+async fn executor(network: Network) -> (Context, Node, DriverClient) {
+    let context = Context::new(network);
+    let (node, _) = context
+        .node::<NoParameters>("executor", &RosArguments::default())
+        .unwrap();
+    let cell = WorkCell::builtin().unwrap();
+    let client = DriverClient::new(&node, &DriverParameters::default(), &cell).unwrap();
+    (context, node, client)
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn of_two_executors_that_start_at_once_one_becomes_active() {
+    for round in 0..10 {
+        let network = Network::unused().unwrap();
+        let begin = Instant::now();
+        let ((_one, one_node, one), (_other, other_node, other)) =
+            tokio::join!(executor(network), executor(network));
+        let activated = tokio::join!(one.activate(&one_node), other.activate(&other_node));
+        let took = begin.elapsed();
+        let (active, loser, loser_node) = match activated {
+            (Ok(active), Err(ActivateError::AnotherIsActive)) => (active, &other, &other_node),
+            (Err(ActivateError::AnotherIsActive), Ok(active)) => (active, &one, &one_node),
+            (one, other) => panic!("round {round}: {} {}", one.is_ok(), other.is_ok()),
+        };
+        println!("round {round}: one was active after {took:?}");
+        // It is not deposed by the other one, which still cannot become active.
+        let refused = tokio::select! {
+            () = active.deposed() => panic!("round {round}: the active one was deposed"),
+            again = loser.activate(loser_node) => again,
+        };
+        assert!(matches!(refused, Err(ActivateError::AnotherIsActive)));
+        // Once the first one ends, the other one may.
+        drop(active);
+        let last = loser.activate(loser_node).await;
+        assert!(last.is_ok(), "round {round}");
+    }
 }

@@ -246,7 +246,7 @@ fn small(network: Network) -> NetworkConfig {
     }
 }
 
-fn the_compact_network_is_what_they_say(judge: Judge) {
+fn the_compact_network_matches_the_reference(judge: Judge) {
     let config = small(Network::Compact(Compact {
         channels: [6, 8, 12, 16],
         feature_channels: 4,
@@ -258,7 +258,7 @@ fn the_compact_network_is_what_they_say(judge: Judge) {
     }
 }
 
-fn the_matching_network_is_what_they_say(judge: Judge) {
+fn the_matching_network_matches_the_reference(judge: Judge) {
     let config = NetworkConfig {
         conditioning: GoalConditioning::Sequence,
         ..small(Network::Matching(Matching {
@@ -276,7 +276,7 @@ fn the_matching_network_is_what_they_say(judge: Judge) {
     }
 }
 
-fn the_matching_network_in_full_size_and_32_bits_is_what_they_say(judge: Judge) {
+fn the_matching_network_in_full_size_and_32_bits_matches_the_reference(judge: Judge) {
     let config = NetworkConfig::matching();
     let loss = PlaceLoss::RightAndOneWrong;
     check(judge, &config, false, loss, 0.7, 1e-5);
@@ -285,28 +285,28 @@ fn the_matching_network_in_full_size_and_32_bits_is_what_they_say(judge: Judge) 
 #[test]
 #[ignore = "needs numpy: cargo xtask test runs it"]
 fn the_matching_network_is_what_numpy_says() {
-    the_matching_network_is_what_they_say(Judge::Numpy);
+    the_matching_network_matches_the_reference(Judge::Numpy);
 }
 
 #[test]
 #[ignore = "needs numpy: cargo xtask test runs it"]
 fn the_matching_network_in_full_size_and_32_bits_is_what_numpy_says() {
-    the_matching_network_in_full_size_and_32_bits_is_what_they_say(Judge::Numpy);
+    the_matching_network_in_full_size_and_32_bits_matches_the_reference(Judge::Numpy);
 }
 
 #[test]
 #[ignore = "needs PyTorch: cargo xtask test runs it where there is one"]
 fn the_matching_network_and_its_gradients_are_what_pytorch_says() {
-    the_matching_network_is_what_they_say(Judge::PyTorch);
+    the_matching_network_matches_the_reference(Judge::PyTorch);
 }
 
 #[test]
 #[ignore = "needs PyTorch: cargo xtask test runs it where there is one"]
 fn the_matching_network_in_full_size_and_32_bits_is_what_pytorch_says() {
-    the_matching_network_in_full_size_and_32_bits_is_what_they_say(Judge::PyTorch);
+    the_matching_network_in_full_size_and_32_bits_matches_the_reference(Judge::PyTorch);
 }
 
-fn the_published_network_is_what_they_say(judge: Judge) {
+fn the_published_network_matches_the_reference(judge: Judge) {
     use Interpolation::{Bilinear, Nearest};
     for (rotation_sampling, sigma_cells) in [(Nearest, 0.0), (Bilinear, 1.0)] {
         let config = small(Network::Resnet43(Resnet43 {
@@ -319,7 +319,7 @@ fn the_published_network_is_what_they_say(judge: Judge) {
     }
 }
 
-fn the_compact_network_in_full_size_and_32_bits_is_what_they_say(judge: Judge) {
+fn the_compact_network_in_full_size_and_32_bits_matches_the_reference(judge: Judge) {
     let config = NetworkConfig::compact();
     check(
         judge,
@@ -334,31 +334,31 @@ fn the_compact_network_in_full_size_and_32_bits_is_what_they_say(judge: Judge) {
 #[test]
 #[ignore = "needs numpy: cargo xtask test runs it"]
 fn the_compact_network_is_what_numpy_says() {
-    the_compact_network_is_what_they_say(Judge::Numpy);
+    the_compact_network_matches_the_reference(Judge::Numpy);
 }
 
 #[test]
 #[ignore = "needs numpy: cargo xtask test runs it"]
 fn the_published_network_is_what_numpy_says() {
-    the_published_network_is_what_they_say(Judge::Numpy);
+    the_published_network_matches_the_reference(Judge::Numpy);
 }
 
 #[test]
 #[ignore = "needs numpy: cargo xtask test runs it"]
 fn the_compact_network_in_full_size_and_32_bits_is_what_numpy_says() {
-    the_compact_network_in_full_size_and_32_bits_is_what_they_say(Judge::Numpy);
+    the_compact_network_in_full_size_and_32_bits_matches_the_reference(Judge::Numpy);
 }
 
 #[test]
 #[ignore = "needs PyTorch: cargo xtask test runs it where there is one"]
 fn the_compact_network_and_its_gradients_are_what_pytorch_says() {
-    the_compact_network_is_what_they_say(Judge::PyTorch);
+    the_compact_network_matches_the_reference(Judge::PyTorch);
 }
 
 #[test]
 #[ignore = "needs PyTorch: cargo xtask test runs it where there is one"]
 fn the_published_network_and_its_gradients_are_what_pytorch_says() {
-    the_published_network_is_what_they_say(Judge::PyTorch);
+    the_published_network_matches_the_reference(Judge::PyTorch);
 }
 
 #[test]
@@ -416,7 +416,7 @@ fn networks_conditioned_on_both_goals_are_what_pytorch_says() {
 #[test]
 #[ignore = "needs PyTorch: cargo xtask test runs it where there is one"]
 fn the_compact_network_in_full_size_and_32_bits_is_what_pytorch_says() {
-    the_compact_network_in_full_size_and_32_bits_is_what_they_say(Judge::PyTorch);
+    the_compact_network_in_full_size_and_32_bits_matches_the_reference(Judge::PyTorch);
 }
 
 #[test]

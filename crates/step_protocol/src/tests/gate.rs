@@ -3,13 +3,14 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use heightmap::{ChangeRules, Heightmap, Workspace};
-use nalgebra::{Isometry2, Vector2};
+use heightmap::{Change, ChangeRules, Heightmap, Workspace};
+use nalgebra::{Isometry2, Point2, Vector2};
 use pick_place::{PickPlace, PrimitiveSettings};
 
 use crate::{
-    ApprovalGate, GateAction, GateRules, JointPositions, OperatorDecision, Proposal, ProposalId,
-    ProposalStatus, Proposed, RequireApproval, RobotState, StepOutcome,
+    ApprovalGate, CannotBegin, GateAction, GateRules, InvalidProposal, JointPositions, MotionCause,
+    Obstacle, OperatorDecision, Proposal, ProposalId, ProposalStatus, Proposed, Recovery, Refusal,
+    RefusalReason, RequireApproval, RobotState, StepOutcome, Unasked,
 };
 
 pub(super) const NOW: Duration = Duration::from_secs(100);
@@ -29,6 +30,7 @@ fn rules() -> GateRules {
         changes: ChangeRules::default(),
         confirmation_grace: GRACE,
         require_approval: RequireApproval::Always,
+        operators: Vec::new(),
     }
 }
 
@@ -56,6 +58,7 @@ pub(super) fn proposal(id: u64) -> Proposal {
         pick_score: 1.0,
         place_score: 1.0,
         success_probability: None,
+        done_probability: None,
         checkpoint: String::new(),
         author: "test".into(),
     }
@@ -66,22 +69,29 @@ pub(super) fn proposal(id: u64) -> Proposal {
 pub(super) struct Robot {
     obstacle: Option<&'static str>,
     no_plan: Option<&'static str>,
+    /// Whether motions are still to be rehearsed.
+    unrehearsed: bool,
     /// Where every joint is (rad).
     joints_rad: f64,
 }
 
 impl RobotState for Robot {
-    fn obstacle(&self) -> Option<String> {
-        self.obstacle.map(str::to_owned)
+    fn obstacle(&self) -> Option<Obstacle> {
+        self.obstacle.map(str::to_owned).map(Obstacle::from)
     }
 
-    fn plan(&self, _: &Proposal) -> Result<(), String> {
-        self.no_plan.map_or(Ok(()), |reason| Err(reason.to_owned()))
-    }
-
-    fn plan_home(&self) -> Result<JointPositions, String> {
+    fn check_motion(&self, _: &Proposal) -> Result<(), CannotBegin> {
         match self.no_plan {
-            Some(reason) => Err(reason.to_owned()),
+            _ if self.unrehearsed => Err(CannotBegin::NotRehearsed),
+            Some(reason) => Err(CannotBegin::Refused(reason.to_owned().into())),
+            None => Ok(()),
+        }
+    }
+
+    fn check_recovery(&self, _: Recovery) -> Result<JointPositions, CannotBegin> {
+        match self.no_plan {
+            _ if self.unrehearsed => Err(CannotBegin::NotRehearsed),
+            Some(reason) => Err(CannotBegin::Refused(reason.to_owned().into())),
             None => Ok(JointPositions::repeat(self.joints_rad)),
         }
     }
@@ -90,7 +100,13 @@ impl RobotState for Robot {
 pub(super) const READY: Robot = Robot {
     obstacle: None,
     no_plan: None,
+    unrehearsed: false,
     joints_rad: 0.0,
+};
+
+const UNREHEARSED: Robot = Robot {
+    unrehearsed: true,
+    ..READY
 };
 
 fn empty() -> Arc<Heightmap> {
@@ -279,6 +295,38 @@ fn what_waits_for_its_proposal_does_not_survive_a_stop_a_fault_or_a_deactivation
 }
 
 #[test]
+fn where_operators_are_named_nobody_else_approves_or_rejects_and_everybody_may_stop() {
+    let id = ProposalId(7);
+    let anybody = ApprovalGate::new(rules());
+    assert_eq!(
+        anybody.check_operator(id, OperatorDecision::Approve, "eve"),
+        Ok(())
+    );
+    let gate = ApprovalGate::new(GateRules {
+        operators: vec!["anna".into(), "bob".into()],
+        ..rules()
+    });
+    for decision in [OperatorDecision::Approve, OperatorDecision::Reject] {
+        for name in ["anna", "bob"] {
+            assert_eq!(gate.check_operator(id, decision, name), Ok(()));
+        }
+        for name in ["eve", "", "Anna", "anna "] {
+            let refusal = gate.check_operator(id, decision, name).unwrap_err();
+            assert!(matches!(refusal, Refusal::NotAnOperator { .. }));
+            let text = refusal.to_string();
+            assert!(
+                text.contains(&format!("`{name}`")) && text.contains("anna"),
+                "{text}"
+            );
+        }
+    }
+    assert_eq!(
+        gate.check_operator(id, OperatorDecision::Stop, "eve"),
+        Ok(())
+    );
+}
+
+#[test]
 fn nothing_goes_on_by_itself_after_a_stop_or_a_fault_until_something_is_approved() {
     let automatic = GateRules {
         require_approval: RequireApproval::Never,
@@ -323,6 +371,21 @@ fn only_a_proposal_that_is_sure_enough_moves_unasked_and_none_after_a_stop() {
         assert_eq!(gate.moves_unasked(ProposalId(id)), moves, "{id}");
         assert!(!gate.moves_unasked(ProposalId(id - 1)), "{id}");
     }
+    // However sure the policy is of it: there may be nothing to do.
+    let done = Proposal {
+        success_probability: Some(1.0),
+        done_probability: Some(0.6),
+        ..proposal(12)
+    };
+    propose(&mut gate, done);
+    assert!(!gate.moves_unasked(ProposalId(12)));
+    propose(
+        &mut gate,
+        Proposal {
+            success_probability: Some(0.9),
+            ..proposal(10)
+        },
+    );
     decide(&mut gate, 10, OperatorDecision::Stop);
     let sure = Proposal {
         success_probability: Some(1.0),
@@ -602,8 +665,13 @@ fn the_arm_goes_home_only_by_an_approval_of_that_very_proposal() {
         ..Robot::default()
     };
     let propose_home = |gate: &mut ApprovalGate, id, robot: &Robot| {
-        let proposed = gate.propose_home(ProposalId(id), robot);
-        proposed.map(|ProposalId(id)| id)
+        let proposed = gate.propose_home(ProposalId(id), Recovery::Home, robot);
+        proposed
+            .map(|ProposalId(id)| id)
+            .map_err(|cannot| match cannot {
+                CannotBegin::Refused(obstacle) => obstacle.into(),
+                CannotBegin::NotRehearsed => "not rehearsed".to_owned(),
+            })
     };
     let reason = propose_home(&mut gate, 50, &stopped).unwrap_err();
     assert!(reason.contains("PROTECTIVE_STOP"), "{reason}");
@@ -656,7 +724,8 @@ fn a_stop_a_rejection_and_a_deactivation_withdraw_the_way_home() {
         (OperatorDecision::Reject, StepOutcome::Rejected),
     ] {
         let mut gate = gate();
-        gate.propose_home(ProposalId(50), &READY).unwrap();
+        gate.propose_home(ProposalId(50), Recovery::Home, &READY)
+            .unwrap();
         let actions = decide(&mut gate, 50, decision);
         assert!(
             matches!(&actions[..], [GateAction::Report(report)] if report.outcome == outcome),
@@ -666,7 +735,8 @@ fn a_stop_a_rejection_and_a_deactivation_withdraw_the_way_home() {
         assert_refused(&gate, actions, &["50", "was"]);
     }
     let mut gate = gate();
-    gate.propose_home(ProposalId(50), &READY).unwrap();
+    gate.propose_home(ProposalId(50), Recovery::Home, &READY)
+        .unwrap();
     gate.deactivate();
     let actions = approve(&mut gate, 50);
     assert_refused(&gate, actions, &["50", "withdrawn"]);
@@ -684,7 +754,7 @@ fn the_way_home_moves_unasked_only_where_nothing_needs_an_approval_and_nothing_w
             ..rules()
         });
         let id = ProposalId(50);
-        gate.propose_home(id, &READY).unwrap();
+        gate.propose_home(id, Recovery::Home, &READY).unwrap();
         assert_eq!(gate.moves_unasked(id), moves);
         gate.remember_stop();
         assert!(!gate.moves_unasked(id));
@@ -705,4 +775,181 @@ fn memory_is_bounded() {
     // What was forgotten is unknown again, what is remembered is superseded.
     assert_eq!(gate.status(ProposalId(8_000)), None);
     assert!(gate.status(ProposalId(9_500)).is_some());
+}
+
+#[test]
+fn what_is_held_is_put_down_by_an_approval_of_that_very_proposal_and_no_way_home_is() {
+    let mut gate = gate();
+    let propose =
+        |gate: &mut ApprovalGate, id, recovery| gate.propose_home(ProposalId(id), recovery, &READY);
+    propose(&mut gate, 50, Recovery::Home).unwrap();
+    // Another recovery is another proposal, and takes the place of the one before.
+    assert_eq!(
+        propose(&mut gate, 51, Recovery::PutDown),
+        Ok(ProposalId(51))
+    );
+    assert_eq!(
+        propose(&mut gate, 52, Recovery::PutDown),
+        Ok(ProposalId(51))
+    );
+    let refused = gate.on_confirmation(ProposalId(50), OperatorDecision::Approve, &READY, NOW);
+    assert!(
+        matches!(refused[..], [GateAction::Report(_)]),
+        "{refused:?}"
+    );
+    let moved = gate.on_confirmation(ProposalId(51), OperatorDecision::Approve, &READY, NOW);
+    assert_eq!(moved, [GateAction::PutDown(ProposalId(51))]);
+    gate.finish(NOW, false);
+    let again = gate.on_confirmation(ProposalId(51), OperatorDecision::Approve, &READY, NOW);
+    assert!(matches!(again[..], [GateAction::Report(_)]), "{again:?}");
+}
+
+#[test]
+fn an_approval_waits_for_the_rehearsal_of_its_motion_and_a_stop_ends_the_wait() {
+    let approve = OperatorDecision::Approve;
+    let id = ProposalId(7);
+    let mut gate = gate();
+    assert_eq!(gate.on_confirmation(id, approve, &UNREHEARSED, NOW), []);
+    let deadline = gate.deadline().unwrap();
+    assert!(deadline > NOW + rules().confirmation_grace);
+    assert_eq!(gate.on_news(&UNREHEARSED, deadline - GRACE), []);
+    let moved = gate.on_news(&READY, deadline - GRACE);
+    assert!(matches!(&moved[..], [GateAction::Move(moved)] if moved.id == id));
+
+    // Found to hit something.
+    let mut gate = self::gate();
+    assert_eq!(gate.on_confirmation(id, approve, &UNREHEARSED, NOW), []);
+    let hits = Robot {
+        no_plan: Some("the forearm would hit the table"),
+        ..READY
+    };
+    let actions = gate.on_news(&hits, NOW);
+    assert_refused(&gate, actions, &["forearm"]);
+
+    // Not rehearsed in time.
+    let mut gate = self::gate();
+    assert_eq!(gate.on_confirmation(id, approve, &UNREHEARSED, NOW), []);
+    let actions = gate.on_news(&UNREHEARSED, deadline);
+    assert_refused(&gate, actions, &["7", "has not been checked", "5s"]);
+
+    let mut gate = self::gate();
+    assert_eq!(gate.on_confirmation(id, approve, &UNREHEARSED, NOW), []);
+    gate.on_confirmation(id, OperatorDecision::Stop, &UNREHEARSED, NOW);
+    assert_eq!(gate.on_news(&READY, NOW), []);
+    assert_eq!(gate.pending(), None);
+}
+
+#[test]
+fn a_way_home_that_was_rehearsed_from_elsewhere_or_on_another_view_has_to_be_called_for_again() {
+    let mut gate = gate();
+    gate.propose_home(ProposalId(50), Recovery::Home, &READY)
+        .unwrap();
+    let approve = OperatorDecision::Approve;
+    let actions = gate.on_confirmation(ProposalId(50), approve, &UNREHEARSED, NOW);
+    assert_refused(&gate, actions, &["50", "call for it again"]);
+    let actions = decide(&mut gate, 50, approve);
+    assert_refused(&gate, actions, &["50", "withdrawn"]);
+}
+
+#[test]
+fn the_reason_of_a_refusal_is_found_in_its_text() {
+    let id = ProposalId(7);
+    let stamp = Duration::from_secs(10);
+    let workspace = Box::new(Workspace::RAVENS);
+    let change = |height_m| Change {
+        area_m2: 1e-4,
+        center_m: Point2::new(0.5, 0.0),
+        height_m,
+        near: true,
+    };
+    let outside = InvalidProposal::OutsideWorkspace {
+        id,
+        which: "pick",
+        x_m: 7.0,
+        y_m: 0.0,
+        workspace,
+    };
+    let frame = InvalidProposal::Frame {
+        id,
+        actual: "camera".into(),
+        expected: "world".into(),
+    };
+    let not_finite = InvalidProposal::NotFinite {
+        id,
+        which: "place",
+        x_m: f64::NAN,
+        y_m: 0.0,
+        yaw_rad: 0.0,
+    };
+    let settings = InvalidProposal::Settings {
+        id,
+        name: "lift_m",
+        value: 7.0,
+        limit: 0.5,
+    };
+    let mut refusals: Vec<Refusal> = vec![
+        Refusal::Unknown { id },
+        Refusal::NothingToStop { id },
+        outside.into(),
+        frame.into(),
+        not_finite.into(),
+        settings.into(),
+        InvalidProposal::DifferentContents { id }.into(),
+        Refusal::Busy { id, moving: id },
+        Refusal::Homing { id },
+        Refusal::HomeFromElsewhere { id },
+        Refusal::OldObservation {
+            id,
+            stamp,
+            moved_until: stamp,
+        },
+        Refusal::NoSourceHeightmap { id, stamp },
+        Refusal::OtherWorkspace { id, stamp },
+        Refusal::ObservationChanged {
+            id,
+            stamp,
+            change: change(Some(0.02)),
+        },
+        Refusal::ObservationChanged {
+            id,
+            stamp,
+            change: change(None),
+        },
+        Refusal::NotRehearsed { id },
+        Refusal::StopCame { id },
+        Refusal::MotionBrokenOff { id },
+    ];
+    let statuses = ProposalStatus::ALL.iter().copied();
+    refusals.extend(statuses.map(|status| Refusal::NotPending { id, status }));
+    let obstacles = RefusalReason::ALL.iter().map(|reason| reason.because("7"));
+    refusals.extend(obstacles.map(|obstacle| Refusal::Robot { id, obstacle }));
+    for refusal in refusals {
+        let text = refusal.to_string();
+        assert_eq!(RefusalReason::of_text(&text), refusal.reason(), "{text}");
+    }
+    for (cause, reason) in [
+        (MotionCause::Proposal(id), RefusalReason::Busy),
+        (MotionCause::Home(id), RefusalReason::OnItsWayHome),
+        (MotionCause::PutDown(id), RefusalReason::Busy),
+    ] {
+        assert_eq!(RefusalReason::of_text(&cause.busy_text()), reason);
+    }
+}
+
+#[test]
+fn after_a_stop_a_sure_proposal_asks_too_until_the_next_approval() {
+    let rule = RequireApproval::Unsure { threshold: 0.9 };
+    let sure = Proposal {
+        success_probability: Some(0.95),
+        ..proposal(7)
+    };
+    let mut unasked = Unasked::new(rule);
+    assert!(unasked.moves(rule, &sure));
+    assert!(!unasked.moves(rule, &proposal(8)), "nothing estimates it");
+    unasked.stop();
+    assert!(!unasked.moves(rule, &sure));
+    unasked.go_on(rule);
+    assert!(unasked.moves(rule, &sure));
+    unasked.go_on(RequireApproval::Always);
+    assert!(!unasked.is_on());
 }

@@ -64,6 +64,7 @@ fn prediction(x: f64) -> Prediction {
         pick_score: 0.9,
         place_score: 0.8,
         success_probability: None,
+        done_probability: None,
     }
 }
 

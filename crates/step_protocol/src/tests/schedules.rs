@@ -1,5 +1,5 @@
 //! All four machines together under random schedules: messages delayed, repeated, reordered and lost, garbage in between, any
-//! party started again, two operators, stops and faults.
+//! party started again, two operators, each a program that answers questions or a person at a page, stops and faults.
 //!
 //! `SCHEDULES=1000000 SEED=7 cargo test --release -p step_protocol schedules -- --nocapture`
 
@@ -16,10 +16,11 @@ use rand_chacha::ChaCha8Rng;
 
 use crate::mutation::{Mutation, plant};
 use crate::{
-    ApprovalGate, Change, Confirmation, Coverage, GateAction, GateRules, Goal, GoalSequence,
-    GoalTracker, Job, JointPositions, Judgement, Observation, Operator, OperatorDecision,
-    PlannerRules, Prediction, Proposal, ProposalId, ProposalPlanner, ProposalStatus, Proposed,
-    Question, RequireApproval, Reward, RobotState, ShownStep, StepJudge, StepOutcome, StepResult,
+    ApprovalGate, CannotBegin, Change, Confirmation, ConfirmationRefusal, Coverage, GateAction,
+    GateRules, Goal, GoalSequence, GoalTracker, Job, JointPositions, Judgement, Observation,
+    Obstacle, Operator, OperatorDecision, PlannerRules, Prediction, Proposal, ProposalId,
+    ProposalPlanner, ProposalStatus, Proposed, Question, Recovery, RefusalKind, RefusalReason,
+    RequireApproval, Reward, RobotState, RunPhase, ShownStep, StepJudge, StepOutcome, StepResult,
     goals_of,
 };
 
@@ -38,7 +39,7 @@ const INBOX: usize = 24;
 /// Actions of a schedule.
 const ACTIONS: usize = 48;
 /// A run that has not ended after so many quiet moments hangs.
-const QUIET_MOMENTS: usize = 60;
+const QUIET_MOMENTS: usize = 200;
 
 /// Who receives messages.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -64,6 +65,7 @@ enum Message {
     /// A message of this id that cannot be read is `Err`.
     Proposal(ProposalId, Result<Proposal, String>),
     Confirmation(Confirmation),
+    ConfirmationRefused(ProposalId, RefusalKind),
     Result(StepResult),
     Reward(Reward),
 }
@@ -85,12 +87,16 @@ enum Action {
     Deactivate,
     /// The network answers.
     Predict,
+    /// The executor has rehearsed the pending proposal.
+    Rehearse,
     /// The motion ends so.
     EndMotion(usize),
     /// The cameras publish: the same heightmap, a newer one, a changed one.
     Observe(usize),
     /// An operator decides without being asked, on a proposal that was published or on none.
     Decide(usize, usize, usize),
+    /// The person at a page looks at it, and decides what it asks, so or so.
+    Look(usize, usize),
     /// Somebody else publishes a proposal.
     Foreign(usize),
     /// Time goes by.
@@ -117,10 +123,12 @@ impl Action {
             54..57 => Self::Lose(party, which),
             57..60 => Self::Restart(party),
             60 => Self::Deactivate,
-            61..70 => Self::Predict,
-            70..79 => Self::EndMotion(which),
-            79..85 => Self::Observe(which),
-            85..91 => Self::Decide(party, which, other),
+            61..67 => Self::Predict,
+            67..70 => Self::Rehearse,
+            70..77 => Self::EndMotion(which),
+            77..82 => Self::Observe(which),
+            82..87 => Self::Look(party, which),
+            87..91 => Self::Decide(party, which, other),
             91..94 => Self::Foreign(which),
             94..96 => Self::Tick,
             96 => Self::SetStep(which),
@@ -150,18 +158,23 @@ struct Robot {
     ready: bool,
     /// Where the arm is: 0 at home, where motions begin and end, something else where one was broken off.
     joints: u32,
+    /// The proposal whose motion was rehearsed from there.
+    rehearsed: Option<ProposalId>,
 }
 
 impl RobotState for Robot {
-    fn obstacle(&self) -> Option<String> {
-        (!self.ready).then(|| "protective stop".to_owned())
+    fn obstacle(&self) -> Option<Obstacle> {
+        (!self.ready).then(|| RefusalReason::SafetyMode.because("is PROTECTIVE_STOP"))
     }
 
-    fn plan(&self, _: &Proposal) -> Result<(), String> {
-        Ok(())
+    fn check_motion(&self, proposal: &Proposal) -> Result<(), CannotBegin> {
+        match self.rehearsed == Some(proposal.id) {
+            true => Ok(()),
+            false => Err(CannotBegin::NotRehearsed),
+        }
     }
 
-    fn plan_home(&self) -> Result<JointPositions, String> {
+    fn check_recovery(&self, _: Recovery) -> Result<JointPositions, CannotBegin> {
         Ok(JointPositions::repeat(f64::from(self.joints)))
     }
 }
@@ -179,6 +192,10 @@ struct World {
     planner: ProposalPlanner,
     gate: ApprovalGate,
     operators: [Operator; 2],
+    /// Which of them are people at a page.
+    at_page: [bool; 2],
+    /// The proposals that each has heard to be refused.
+    refused: [BTreeSet<ProposalId>; 2],
     inboxes: [VecDeque<Message>; 5],
     job: Option<Job>,
     robot: Robot,
@@ -247,6 +264,7 @@ fn gate() -> ApprovalGate {
         changes: ChangeRules::default(),
         confirmation_grace: GRACE,
         require_approval: RequireApproval::Always,
+        operators: Vec::new(),
     })
 }
 
@@ -276,21 +294,30 @@ fn predict(job: &Job) -> Result<Prediction, String> {
         pick_score: 1.0,
         place_score: 1.0,
         success_probability: None,
+        done_probability: None,
     })
 }
 
 impl World {
-    fn new(clock_runs: bool) -> Self {
+    fn new(
+        Setting {
+            clock_runs,
+            at_page,
+        }: Setting,
+    ) -> Self {
         let mut world = Self {
             tracker: tracker(),
             planner: planner(),
             gate: gate(),
-            operators: [Operator::new(true), Operator::new(true)],
+            operators: at_page.map(|at_page| Operator::new(!at_page)),
+            at_page,
+            refused: Default::default(),
             inboxes: Default::default(),
             job: None,
             robot: Robot {
                 ready: true,
                 joints: 0,
+                rehearsed: None,
             },
             now: Duration::ZERO,
             clock_runs,
@@ -329,7 +356,8 @@ impl World {
             Message::Heightmap(_) => &[Planner, Gate],
             Message::Goal(_) => &[Planner, Operator(0), Operator(1)],
             Message::Proposal(..) => &[Tracker, Gate, Operator(0), Operator(1)],
-            Message::Confirmation(_) => &[Tracker, Planner, Gate],
+            Message::Confirmation(_) => &[Tracker, Planner, Gate, Operator(0), Operator(1)],
+            Message::ConfirmationRefused(..) => &[Operator(0), Operator(1)],
             Message::Result(_) => &[Tracker, Planner, Operator(0), Operator(1)],
             Message::Reward(_) => &[Operator(0), Operator(1)],
         };
@@ -399,6 +427,7 @@ impl World {
             Party::Gate => {
                 // The watchdog stops the arm; nobody reports a result.
                 self.gate = gate();
+                self.robot.rehearsed = None;
                 self.moved_since_start.clear();
                 self.approvals.clear();
                 self.newest_at_gate = None;
@@ -408,7 +437,10 @@ impl World {
                     self.move_scene(0.0);
                 }
             }
-            Party::Operator(index) => self.operators[index] = Operator::new(true),
+            Party::Operator(index) => {
+                self.operators[index] = Operator::new(!self.at_page[index]);
+                self.refused[index].clear();
+            }
         }
         self.send_latched(party);
     }
@@ -426,6 +458,11 @@ impl World {
             Party::Planner => self.planner_receives(message),
             Party::Gate => self.gate_receives(message),
             Party::Operator(index) => {
+                if let Message::Result(result) = &message
+                    && result.outcome == StepOutcome::Refused
+                {
+                    self.refused[index].insert(result.proposal_id);
+                }
                 let operator = &mut self.operators[index];
                 let question = match message {
                     Message::Goal(goal) => {
@@ -435,31 +472,91 @@ impl World {
                     Message::Proposal(_, Ok(proposal)) => operator.on_proposal(proposal),
                     Message::Result(result) => operator.on_result(result),
                     Message::Reward(reward) => operator.on_reward(reward),
+                    Message::Confirmation(confirmation) => {
+                        operator.on_confirmation(&confirmation, self.now);
+                        None
+                    }
+                    Message::ConfirmationRefused(id, kind) => {
+                        operator.on_confirmation_refused(id, Some(kind));
+                        None
+                    }
                     _ => None,
                 };
-                question
-                    .into_iter()
-                    .for_each(|question| self.answer(index, &question));
+                if let Some(question) = question
+                    && !self.at_page[index]
+                {
+                    self.answer(index, &question);
+                }
                 Ok(())
             }
         }
     }
 
     fn answer(&mut self, operator: usize, question: &Question) {
-        self.confirm(
+        self.decide(
             operator,
             question.proposal_id(),
             question.automatic_answer(),
         );
     }
 
-    fn confirm(&mut self, operator: usize, id: ProposalId, decision: OperatorDecision) {
-        self.publish(Message::Confirmation(Confirmation {
+    fn decide(&mut self, operator: usize, id: ProposalId, decision: OperatorDecision) {
+        let confirmation = Confirmation {
             stamp: self.now,
             proposal_id: id,
             decision,
             operator_name: format!("operator {operator}"),
-        }));
+        };
+        self.operators[operator].decide(&confirmation, self.now);
+        self.publish(Message::Confirmation(confirmation));
+    }
+
+    /// The page asks again by itself what was not answered.
+    fn refresh(&mut self, index: usize) {
+        let operator = &mut self.operators[index];
+        if self.motion.is_some() {
+            operator.on_motion(self.now);
+        }
+        operator.ask_again(self.now);
+        if let Some(id) = operator.probe(self.now) {
+            self.decide(index, id, OperatorDecision::Reject);
+        }
+    }
+
+    /// The person at the page decides what it asks: as it should be, or on a whim.
+    fn look(&mut self, index: usize, whim: usize) -> Check {
+        let operator = &self.operators[index];
+        let Some(id) = operator.current().map(|proposal| proposal.id) else {
+            return self.continue_run(index);
+        };
+        // In the end the person wants another one than one that was refused.
+        let is_good = !(self.fair && self.refused[index].contains(&id));
+        let is_planned = self.robot.rehearsed == Some(id) && is_good;
+        let decision = match (operator.phase(), whim % 8) {
+            (RunPhase::Proposed, 1) => OperatorDecision::Reject,
+            (RunPhase::Proposed | RunPhase::Moving, 2) => OperatorDecision::Stop,
+            (RunPhase::Proposed, _) if is_planned => OperatorDecision::Approve,
+            // Its motion is shown soon, or never.
+            (RunPhase::Proposed, _) if self.fair => OperatorDecision::Reject,
+            (RunPhase::AwaitingConfirmation | RunPhase::Fault, 1..4) => OperatorDecision::Retry,
+            (RunPhase::AwaitingConfirmation | RunPhase::Fault, _) => OperatorDecision::Advance,
+            _ => return self.continue_run(index),
+        };
+        self.decide(index, id, decision);
+        Ok(())
+    }
+
+    /// The person has a run that the page shows as stopped go on with the present step.
+    fn continue_run(&mut self, index: usize) -> Check {
+        if self.operators[index].phase() != RunPhase::Stopped {
+            return Ok(());
+        }
+        let (step, _, _) = self.tracker.progress();
+        if let Ok(change) = self.tracker.set_step(step) {
+            self.operators[index].on_continued();
+            self.after_tracker(change, None)?;
+        }
+        Ok(())
     }
 
     fn tracker_receives(&mut self, message: Message) -> Check {
@@ -493,9 +590,12 @@ impl World {
             Message::Confirmation(confirmation) => {
                 let id = confirmation.proposal_id;
                 let judgement = Judgement::from_decision(confirmation.decision);
-                let Ok(change) = self.tracker.on_confirmation(&confirmation) else {
-                    // Refused, and told so.
-                    return self.after_tracker(Change::None, None);
+                let change = match self.tracker.on_confirmation(&confirmation) {
+                    Ok(change) => change,
+                    Err(refusal) => {
+                        self.publish_refusal(id, &refusal);
+                        return self.after_tracker(Change::None, None);
+                    }
                 };
                 match (judgement, &change) {
                     (Some(judgement), Change::Goal(_)) => {
@@ -546,7 +646,8 @@ impl World {
 
     /// `moved`: the tracker has been told of the motion for this proposal.
     fn after_tracker(&mut self, change: Change, moved: Option<ProposalId>) -> Check {
-        for (id, _) in self.tracker.take_refused() {
+        for (id, refusal) in self.tracker.take_refused() {
+            self.publish_refusal(id, &refusal);
             if self.queued.remove(&id).is_none() {
                 return violation(format!("a decision on {id} was refused that did not wait"));
             }
@@ -562,6 +663,10 @@ impl World {
             self.publish_goal();
         }
         Ok(())
+    }
+
+    fn publish_refusal(&mut self, id: ProposalId, refusal: &ConfirmationRefusal) {
+        self.publish(Message::ConfirmationRefused(id, refusal.kind()));
     }
 
     fn planner_receives(&mut self, message: Message) -> Check {
@@ -701,6 +806,9 @@ impl World {
                     if !published.is_some_and(|published| published.contains(&proposal)) {
                         return violation(format!("{id} moves otherwise than it was published"));
                     }
+                    if self.robot.rehearsed != Some(id) {
+                        return violation(format!("{id} moves and was not rehearsed"));
+                    }
                     if !self.moved_since_start.insert(id) {
                         return violation(format!("{id} moves twice"));
                     }
@@ -709,7 +817,7 @@ impl World {
                     self.cancelled = false;
                     self.motion = Some(Motion::Proposal(proposal));
                 }
-                GateAction::GoHome(id) => {
+                GateAction::GoHome(id) | GateAction::PutDown(id) => {
                     if self.motion.is_some() {
                         return violation(format!("{id} moves the arm home while it moves"));
                     }
@@ -768,6 +876,7 @@ impl World {
             true => StepOutcome::Stopped,
             false => outcome,
         };
+        self.robot.rehearsed = None;
         let changes = outcome == StepOutcome::Placed || delta_reward != 0.0;
         self.move_scene(if changes { 0.1 } else { 0.0 });
         let end = self.seen.stamp;
@@ -838,6 +947,7 @@ impl World {
             pick_score: 1.0,
             place_score: 1.0,
             success_probability: None,
+            done_probability: None,
             checkpoint: String::new(),
             author: "somebody".into(),
         };
@@ -921,6 +1031,7 @@ impl World {
                 self.send_latched(Party::Gate);
             }
             Action::Predict => return self.predict(),
+            Action::Rehearse => return self.rehearse(),
             Action::EndMotion(which) => {
                 let ends = [
                     (StepOutcome::Placed, 1.0),
@@ -953,11 +1064,27 @@ impl World {
                 let home = self.homes.iter().rev().nth(which / 2 % 2).copied();
                 let id = home.filter(|_| which % 2 == 0).or(id);
                 let decision = OperatorDecision::ALL[decision % 6];
-                self.confirm(number % 2, id.unwrap_or(unknown), decision);
+                // At a terminal: who sits at a page hears of it.
+                self.publish(Message::Confirmation(Confirmation {
+                    stamp: self.now,
+                    proposal_id: id.unwrap_or(unknown),
+                    decision,
+                    operator_name: format!("terminal {}", number % 2),
+                }));
+            }
+            Action::Look(number, whim) => {
+                if self.at_page[number % 2] {
+                    return self.look(number % 2, whim);
+                }
             }
             Action::Foreign(kind) => self.foreign(kind),
             Action::Tick => {
                 self.now += GRACE;
+                for index in 0..2 {
+                    if self.at_page[index] {
+                        self.refresh(index);
+                    }
+                }
                 return self.ask_gate();
             }
             Action::SetStep(step) => {
@@ -968,7 +1095,7 @@ impl World {
             Action::Obstacle(obstacle) => self.robot.ready = !obstacle,
             Action::Home => {
                 let new = ProposalId(1_000_000 + self.homes.len() as u64);
-                let Ok(id) = self.gate.propose_home(new, &self.robot) else {
+                let Ok(id) = self.gate.propose_home(new, Recovery::Home, &self.robot) else {
                     return Ok(());
                 };
                 if self.motion.is_some() {
@@ -1019,6 +1146,11 @@ impl World {
             self.publish(Message::Heightmap(self.seen.clone()));
             self.settle()?;
             for index in 0..2 {
+                if self.at_page[index] {
+                    self.refresh(index);
+                    self.look(index, 0)?;
+                    continue;
+                }
                 for question in self.operators[index].on_silence() {
                     self.answer(index, &question);
                 }
@@ -1030,7 +1162,18 @@ impl World {
         ))
     }
 
-    /// Everything on its way arrives, the network answers, motions end.
+    /// The pending proposal, where it is to be rehearsed.
+    fn unrehearsed(&self) -> Option<ProposalId> {
+        let pending = self.gate.pending().map(|pending| pending.id);
+        pending.filter(|_| pending != self.robot.rehearsed)
+    }
+
+    fn rehearse(&mut self) -> Check {
+        self.robot.rehearsed = self.unrehearsed().or(self.robot.rehearsed);
+        self.ask_gate()
+    }
+
+    /// Everything on its way arrives, the network answers, motions are rehearsed and end.
     fn settle(&mut self) -> Check {
         for _ in 0..10_000 {
             let mut quiet = true;
@@ -1043,6 +1186,10 @@ impl World {
             if self.job.is_some() {
                 quiet = false;
                 self.predict()?;
+            }
+            if self.unrehearsed().is_some() {
+                quiet = false;
+                self.rehearse()?;
             }
             if quiet && self.motion.is_some() {
                 quiet = false;
@@ -1062,8 +1209,28 @@ fn schedule(seed: u64) -> Vec<Action> {
     (0..count).map(|_| Action::random(&mut rng)).collect()
 }
 
-fn run(actions: &[Action], clock_runs: bool) -> Check {
-    let mut world = World::new(clock_runs);
+/// What is the same all through a schedule.
+#[derive(Clone, Copy, Debug)]
+struct Setting {
+    clock_runs: bool,
+    at_page: [bool; 2],
+}
+
+impl Setting {
+    fn of(seed: u64) -> Self {
+        Self {
+            clock_runs: seed.is_multiple_of(2),
+            at_page: match seed / 2 % 4 {
+                0 | 1 => [false, false],
+                2 => [false, true],
+                _ => [true, true],
+            },
+        }
+    }
+}
+
+fn run(actions: &[Action], setting: Setting) -> Check {
+    let mut world = World::new(setting);
     for action in actions {
         world.perform(*action)?;
     }
@@ -1071,7 +1238,7 @@ fn run(actions: &[Action], clock_runs: bool) -> Check {
 }
 
 /// The shortest part of a schedule, found by leaving out ever smaller pieces, that still goes wrong.
-fn shrunk(mut actions: Vec<Action>, clock_runs: bool) -> (Vec<Action>, Violation) {
+fn shrunk(mut actions: Vec<Action>, setting: Setting) -> (Vec<Action>, Violation) {
     let mut found = Violation(String::new());
     let mut piece = actions.len().max(1);
     loop {
@@ -1079,7 +1246,7 @@ fn shrunk(mut actions: Vec<Action>, clock_runs: bool) -> (Vec<Action>, Violation
         while start < actions.len() {
             let end = (start + piece).min(actions.len());
             let shorter = [&actions[..start], &actions[end..]].concat();
-            match run(&shorter, clock_runs) {
+            match run(&shorter, setting) {
                 Err(violation) => {
                     found = violation;
                     actions = shorter;
@@ -1092,7 +1259,7 @@ fn shrunk(mut actions: Vec<Action>, clock_runs: bool) -> (Vec<Action>, Violation
         }
         piece /= 2;
     }
-    if let Err(violation) = run(&actions, clock_runs) {
+    if let Err(violation) = run(&actions, setting) {
         found = violation;
     }
     (actions, found)
@@ -1102,12 +1269,12 @@ fn shrunk(mut actions: Vec<Action>, clock_runs: bool) -> (Vec<Action>, Violation
 fn first_violation(seed: u64, count: u64) -> Option<(u64, String)> {
     (seed..seed + count).find_map(|seed| {
         let actions = schedule(seed);
-        let clock_runs = seed % 2 == 0;
-        run(&actions, clock_runs).err()?;
-        let (actions, violation) = shrunk(actions, clock_runs);
+        let setting = Setting::of(seed);
+        run(&actions, setting).err()?;
+        let (actions, violation) = shrunk(actions, setting);
         let actions: Vec<_> = actions.iter().map(|action| format!("{action:?}")).collect();
         let actions = actions.join("\n    ");
-        let text = format!("seed {seed}, clock runs: {clock_runs}: {violation}\n    {actions}");
+        let text = format!("seed {seed}, {setting:?}: {violation}\n    {actions}");
         Some((seed, text))
     })
 }

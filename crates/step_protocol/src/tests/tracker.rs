@@ -72,6 +72,7 @@ pub(super) fn proposal(id: u64, step: u32, attempt: u32) -> Proposal {
         pick_score: 1.0,
         place_score: 1.0,
         success_probability: None,
+        done_probability: None,
         checkpoint: String::new(),
         author: "test".into(),
     }

@@ -1,5 +1,7 @@
 //! Camera images: rendered when the scene rests, and published until it changes.
 
+use std::time::{Duration, Instant};
+
 use cell_emulation::cameras::Frame;
 use node_kit::Level;
 use simulated_cell::NOISY_PERIOD;
@@ -38,6 +40,10 @@ impl Hardware {
 
     /// Renders what the cameras see now.
     pub(super) fn render(&mut self) -> anyhow::Result<()> {
+        if let Some(shutter) = &mut self.shutter {
+            shutter.show(Some(self.cell.still()?));
+            return Ok(());
+        }
         let mut frames: Vec<Vec<_>> = Vec::new();
         self.cell.take_images(|shot| {
             frames.resize_with(shot.set + 1, Vec::new);
@@ -50,7 +56,27 @@ impl Hardware {
         Ok(())
     }
 
+    /// The scene is not still any more.
+    pub(super) fn forget_scene(&mut self) {
+        self.frames.clear();
+        if let Some(shutter) = &mut self.shutter {
+            shutter.show(None);
+        }
+    }
+
     pub(super) fn publish_frames(&mut self) {
+        if let Some(shutter) = &self.shutter {
+            // Nobody has to see what costs a core.
+            let graph = self.node.graph();
+            if shutter.has_scene() && self.cameras.iter().any(|camera| camera.is_watched(&graph)) {
+                let set = self.cell.count_set();
+                shutter.take(set, self.cell.time());
+            }
+            // In time, however long something else took.
+            let period = Duration::from_secs_f64(self.parameters.frames_period_s);
+            self.next_frames = (self.next_frames + period).max(Instant::now());
+            return;
+        }
         for (camera, frame) in self.frames.get(self.next_set).into_iter().flatten() {
             self.cameras[*camera].publish(frame.clone());
         }

@@ -41,7 +41,7 @@ impl Hardware {
             goal.end(End::Failed(failure));
             return Ok(());
         }
-        self.frames.clear();
+        self.forget_scene();
         let end = self.drive(&goal)?;
         match &end {
             End::Failed(failure) => error!("goal aborted: {failure}"),
@@ -140,6 +140,10 @@ impl Hardware {
                 self.cell.cancel();
                 self.coast_unheard();
                 return Ok(End::withdrawn("the driver is gone"));
+            }
+            if let Some(reason) = self.acceptance.lost_controller() {
+                self.cell.cancel();
+                return Ok(End::withdrawn(&reason));
             }
             if !self.fault.lets_move() {
                 self.cell.cancel();

@@ -16,9 +16,9 @@ use ur5::WorkCell;
 
 use crate::parameters::SimWorkcellParameters;
 
-/// Who commands reads the status; once nobody has for so long, it is repeated less often.
+/// A client that sends commands reads the status; so long after the last command the status is published less often.
 const ATTENTIVE: Duration = Duration::from_secs(1);
-/// By so much less often.
+/// Factor of the status period while no client sends commands.
 const INATTENTIVE_FACTOR: f64 = 5.0;
 
 /// Where the cameras are, as their calibration has it, and the links that stand still.

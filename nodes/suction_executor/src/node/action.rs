@@ -4,11 +4,10 @@ use msgs::sctn_msgs::{self, ExecutePickPlace, ExecutePickPlaceFeedback, ExecuteP
 use msgs::{convert, std_msgs};
 use node_kit::{NewGoal, RunningGoal};
 use pick_place::Phase;
-use step_protocol::{OperatorDecision, ProposalId, Proposed, Report, StepOutcome};
+use step_protocol::{OperatorDecision, ProposalId, Proposed, Report, StepOutcome, StopCause};
 use tracing::info;
 
 use super::Executor;
-use super::motion::{Cause, StopCause};
 use super::proposals::read_proposal;
 
 /// A goal of the action, from its acceptance to its end.
@@ -26,19 +25,16 @@ impl Executor<'_> {
         let id = ProposalId(new.goal.proposal.id);
         let busy = match (&self.goal, &self.motion) {
             (Some(goal), _) => Some(format!("a goal for proposal {} is active", goal.id)),
-            (None, Some(motion)) => Some(match motion.cause {
-                Cause::Proposal(moving) => format!("proposal {moving} is being carried out"),
-                Cause::Home(_) => "the arm is on its way home".to_owned(),
-            }),
+            (None, Some(motion)) => Some(motion.cause.busy_text()),
             (None, None) => None,
         };
         let pending = match busy {
             Some(busy) => Err(busy),
             None => {
                 let proposal = read_proposal(&new.goal.proposal);
-                let proposed = self.gate.on_proposal(id, proposal.clone());
+                let proposed = self.gate.on_proposal(id, proposal);
                 if matches!(proposed, Proposed::Pending) {
-                    self.show_plan(proposal.ok());
+                    self.rehearse_next();
                 }
                 match proposed {
                     Proposed::Invalid(reason) => Err(reason.to_string()),
@@ -57,9 +53,12 @@ impl Executor<'_> {
             return;
         }
         info!("proposal {id}: a goal of the action");
+        let (goal, running) = new.accept();
+        // Before anything is asked about it or done for it.
+        self.accepted.publish(goal.proposal);
         self.goal = Some(Goal {
             id,
-            running: new.accept().1,
+            running,
             moving: false,
             cancelling: false,
         });

@@ -1,59 +1,27 @@
-//! Motions: their start, their end, and what is said of it.
+//! Motions: start, end, reported result.
 
 use std::hash::{DefaultHasher, Hash as _, Hasher as _};
 use std::sync::Arc;
 use std::time::Duration;
 
 use anyhow::Context as _;
-use msgs::sctn_msgs::ProposeHomeResponse;
-use node_kit::{Level, RequestId};
-use pick_place::{ExecuteError, Outcome, Phase, go_home};
-use step_protocol::{OperatorDecision, Proposal, ProposalId, Report, StepOutcome};
+use node_kit::Level;
+use pick_place::{ExecuteError, Outcome, Phase, go_home, put_down};
+use rehearsal::{HOME_SETTINGS, Picked, touchdown};
+use step_protocol::{
+    MotionCause, MotionEnd, MotionWord, Proposal, ProposalId, Report, StepOutcome, StopCause,
+};
 use tokio::runtime::Handle;
 use tokio::task::JoinHandle;
 use tokio_util::sync::CancellationToken;
-use tracing::{info, warn};
-use ur_driver::planted::{Planted, is_planted};
+use tracing::info;
 use ur_driver::{DriverError, DriverRobot};
 
 use super::Executor;
-use crate::dry_run::HOME_SETTINGS;
-use crate::surface::touchdown;
-
-/// What moves the arm.
-#[derive(Clone, Copy, PartialEq, Eq)]
-pub(super) enum Cause {
-    /// An approved proposal.
-    Proposal(ProposalId),
-    /// An approved way home.
-    Home(ProposalId),
-}
-
-/// Why a motion is stopped.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) enum StopCause {
-    Operator,
-    GoalCancelled,
-    NobodyPresent,
-    Deactivated,
-    Shutdown,
-}
-
-impl StopCause {
-    pub(super) const fn text(self) -> &'static str {
-        match self {
-            Self::Operator => "stopped by the operator",
-            Self::GoalCancelled => "stopped because its goal was cancelled",
-            Self::NobodyPresent => "stopped because no operator is present",
-            Self::Deactivated => "stopped because the executor was deactivated",
-            Self::Shutdown => "stopped because the executor was told to end",
-        }
-    }
-}
 
 /// A primitive, or the way home, under way.
 pub(super) struct Motion {
-    pub(super) cause: Cause,
+    pub(super) cause: MotionCause,
     stop: CancellationToken,
     /// What has stopped it first.
     stopped: Option<StopCause>,
@@ -82,7 +50,8 @@ pub(super) struct Ended {
 impl Executor<'_> {
     pub(super) fn begin(&mut self, proposal: Proposal) {
         info!("proposal {}: moving", proposal.id);
-        self.stop_memory.forget();
+        let motion = format!("the motion of proposal {}", proposal.id);
+        self.stop_memory.begin(&motion, true);
         if let Some(goal) = &mut self.goal {
             goal.moving = goal.id == proposal.id;
         }
@@ -98,8 +67,11 @@ impl Executor<'_> {
             // The receiver lives as long as the node.
             let _ = phases.send(phase);
         };
-        self.picked = Some(proposal.action.pick);
-        self.start(Cause::Proposal(id), move |robot| {
+        self.picked = seen.as_ref().map(|(seen, _)| Picked {
+            tip: proposal.action.tips().0,
+            seen: Arc::clone(seen),
+        });
+        self.start(MotionCause::Proposal(id), move |robot| {
             let Proposal {
                 action, settings, ..
             } = &proposal;
@@ -117,39 +89,8 @@ impl Executor<'_> {
         });
     }
 
-    /// Proposes the way home, for after a stop or a fault. The call may come again because its answer was lost.
-    pub(super) fn on_propose_home(&mut self, call: RequestId) {
-        let robot = self.robot();
-        let id = self.home_id();
-        let answer = match self.gate.propose_home(id, &robot) {
-            Ok(id) => {
-                info!("proposal {id}: the way home");
-                self.publish_plan(robot.dry_run_home(), id);
-                let unasked = self.gate.moves_unasked(id) || is_planted(Planted::HomeUnasked);
-                if unasked {
-                    self.confirm(id, OperatorDecision::Approve);
-                }
-                ProposeHomeResponse {
-                    success: true,
-                    message: String::new(),
-                    proposal_id: id.0,
-                    needs_approval: !unasked,
-                }
-            }
-            Err(reason) => {
-                warn!("home: {reason}");
-                ProposeHomeResponse {
-                    success: false,
-                    message: reason,
-                    ..Default::default()
-                }
-            }
-        };
-        self.home.respond(call, answer);
-    }
-
     /// An id for a way home: of the present time and place.
-    fn home_id(&self) -> ProposalId {
+    pub(super) fn home_id(&self) -> ProposalId {
         let mut hash = DefaultHasher::new();
         self.node.clock().now_ns().hash(&mut hash);
         self.origin.elapsed().hash(&mut hash);
@@ -164,16 +105,33 @@ impl Executor<'_> {
     /// Brings the arm home, straight up first; suction stays as it is.
     pub(super) fn begin_home(&mut self, id: ProposalId) {
         info!("proposal {id}: moving home");
+        self.stop_memory.begin("the way home", false);
         let arm = self.work_cell.arm.clone();
-        self.start(Cause::Home(id), move |robot| {
+        self.start(MotionCause::Home(id), move |robot| {
             go_home(robot, &arm, &HOME_SETTINGS).map(|()| None)
+        });
+    }
+
+    /// Puts down what is held where it was picked, and brings the arm home.
+    pub(super) fn begin_put_down(&mut self, id: ProposalId) {
+        info!("proposal {id}: putting down what is held");
+        self.stop_memory.begin("putting down what is held", false);
+        let arm = self.work_cell.arm.clone();
+        // The gate has asked for it before.
+        let what = self.robot().put_down();
+        self.start(MotionCause::PutDown(id), move |robot| {
+            let what = what.map_err(|reason| ExecuteError::Robot {
+                phase: Phase::Retreat,
+                error: DriverError::Fault(reason),
+            })?;
+            put_down(robot, &arm, &what, &HOME_SETTINGS).map(|()| None)
         });
     }
 
     /// Moves the arm on a thread of its own.
     pub(super) fn start(
         &mut self,
-        cause: Cause,
+        cause: MotionCause,
         work: impl FnOnce(&mut DriverRobot) -> Result<Option<Outcome>, ExecuteError<DriverError>>
         + Send
         + 'static,
@@ -194,7 +152,7 @@ impl Executor<'_> {
 
     pub(super) fn on_end(
         &mut self,
-        cause: Cause,
+        cause: MotionCause,
         stopped: Option<StopCause>,
         ended: anyhow::Result<Ended>,
     ) {
@@ -205,44 +163,35 @@ impl Executor<'_> {
             Ok(ended) => (Ok(ended.result), ended.stamps),
             Err(error) => (Err(error), None),
         };
-        let (outcome, mut reason) = match result {
-            Ok(Ok(Some(outcome))) => (StepOutcome::from(outcome), why(outcome).to_owned()),
-            Ok(Ok(None)) => (StepOutcome::AtHome, String::new()),
+        let end = match result {
+            Ok(Ok(outcome)) => MotionEnd::Done(outcome),
             Ok(Err(ExecuteError::Robot {
                 phase,
                 error: DriverError::Stopped,
-            })) => (
-                StepOutcome::Stopped,
-                format!("{phase:?}: {}", stopped.map_or("stopped", StopCause::text)),
-            ),
-            Ok(Err(error)) => (StepOutcome::Fault, error.to_string()),
-            Err(error) => (StepOutcome::Fault, format!("{error:#}")),
+            })) => MotionEnd::Stopped(phase),
+            Ok(Err(error)) => MotionEnd::Failed(error.to_string()),
+            Err(error) => MotionEnd::Failed(format!("{error:#}")),
         };
-        let broken_off = matches!(outcome, StepOutcome::Stopped | StepOutcome::Fault);
-        if broken_off {
-            self.stop_memory.remember(&reason);
-            reason += "; the arm stands where it is, suction is as it was; a new observation and approval are needed";
-        } else if stopped.is_some() {
-            reason = format!("the stop came after the end. {reason}")
-                .trim()
-                .to_owned();
+        let MotionWord {
+            outcome,
+            reason,
+            broken_off,
+        } = end.word(cause, stopped);
+        if let Some(reason) = &broken_off {
+            self.stop_memory.remember(reason);
         }
-        let level = if outcome == StepOutcome::Fault {
-            Level::Error
-        } else {
-            Level::Ok
+        self.stop_memory.end();
+        let level = match outcome {
+            StepOutcome::Fault => Level::Error,
+            _ => Level::Ok,
         };
         self.node.diagnostics().set("motion", level, &reason, []);
         // Observations from then on show the result. Simulated time may still be on its way.
-        let now = Duration::from_nanos(self.node.clock().now_ns().max(0) as u64);
+        let now = self.node.clock().time();
         let end = stamps.map_or(now, |(_, last)| last.max(now));
         let duration = stamps.map_or(Duration::ZERO, |(first, last)| last - first.min(last));
-        let actions = self.gate.finish(end, broken_off);
-        let (id, outcome) = match cause {
-            Cause::Proposal(id) => (id, outcome),
-            Cause::Home(id) if broken_off => (id, StepOutcome::NotHome),
-            Cause::Home(id) => (id, StepOutcome::AtHome),
-        };
+        let actions = self.gate.finish(end, broken_off.is_some());
+        let id = cause.id();
         let report = Report {
             id,
             outcome,
@@ -254,13 +203,14 @@ impl Executor<'_> {
         self.plant_at_end(outcome);
         self.act(actions);
         self.ask_again();
+        self.rehearse_next();
     }
 }
 
 /// Waits for the end of a motion, and takes it; for ever when there is none.
 pub(super) async fn end_of(
     motion: &mut Option<Motion>,
-) -> (Cause, Option<StopCause>, anyhow::Result<Ended>) {
+) -> (MotionCause, Option<StopCause>, anyhow::Result<Ended>) {
     match motion {
         Some(running) => {
             let ended = (&mut running.task).await;
@@ -270,15 +220,5 @@ pub(super) async fn end_of(
             (cause, stopped, ended)
         }
         None => std::future::pending().await,
-    }
-}
-
-fn why(outcome: Outcome) -> &'static str {
-    match outcome {
-        Outcome::Placed => "",
-        Outcome::NoContact => "the descent met nothing to pick",
-        Outcome::GraspFailed => "suction held nothing",
-        Outcome::Dropped => "the object was lost on the way",
-        Outcome::LagAborted => "the tip lagged too far behind; the object was released",
     }
 }

@@ -18,8 +18,11 @@ pub(super) struct Memory {
 }
 
 impl Executor<'_> {
-    /// A proposal has arrived.
-    pub(super) fn plant_at_proposal(&mut self, proposal: Proposal) {
+    /// A proposal has arrived that can be approved.
+    pub(super) fn plant_at_proposal(&mut self) {
+        let Some(proposal) = self.gate.pending().cloned() else {
+            return;
+        };
         let id = proposal.id;
         self.planted.proposals.push(proposal);
         if is_planted(Planted::MovesUnapproved) {

@@ -1,25 +1,23 @@
 //! Proposals and the operator's confirmations.
 
-use msgs::{convert, sctn_msgs, std_msgs};
-use step_protocol::{GateAction, Judgement, OperatorDecision, Proposal, ProposalId, Proposed};
-use tracing::{info, warn};
+use msgs::{convert, sctn_msgs};
+use step_protocol::{
+    GateAction, Judgement, OperatorDecision, Proposal, ProposalId, Proposed, StopCause,
+};
+use tracing::info;
+use ur_driver::planted::{Planted, is_planted};
 
 use super::Executor;
-use super::motion::StopCause;
-use crate::dry_run::{PlannedPrimitive, planned_motion};
 
 impl Executor<'_> {
     pub(super) fn on_proposal(&mut self, message: sctn_msgs::PickPlace) {
         let id = ProposalId(message.id);
-        let proposal = read_proposal(&message);
-        match self.gate.on_proposal(id, proposal.clone()) {
+        match self.gate.on_proposal(id, read_proposal(&message)) {
             Proposed::Pending => {
                 info!("proposal {id}");
                 #[cfg(feature = "planted_faults")]
-                proposal
-                    .iter()
-                    .for_each(|proposal| self.plant_at_proposal(proposal.clone()));
-                self.show_plan(proposal.ok());
+                self.plant_at_proposal();
+                self.rehearse_next();
                 if self.gate.moves_unasked(id) {
                     self.confirm(id, OperatorDecision::Approve);
                 }
@@ -38,42 +36,8 @@ impl Executor<'_> {
         self.ask_again();
     }
 
-    /// Publishes how a pending proposal would be carried out, or why it cannot be; in the latter case once more when it can.
-    pub(super) fn show_plan(&mut self, proposal: Option<Proposal>) {
-        let Some(proposal) = proposal else {
-            return;
-        };
-        let planned = self.robot().dry_run(&proposal);
-        let is_planned = planned.is_ok();
-        self.publish_plan(planned, proposal.id);
-        self.unplanned = (!is_planned).then_some(proposal);
-    }
-
-    /// The robot's state or a heightmap may have arrived since the last plan failed.
-    pub(super) fn plan_again(&mut self) {
-        let proposal = self.unplanned.take_if(|_| self.motion.is_none());
-        let Some(proposal) = proposal else {
-            return;
-        };
-        match self.robot().dry_run(&proposal) {
-            Ok(planned) => self.publish_plan(Ok(planned), proposal.id),
-            Err(_) => self.unplanned = Some(proposal),
-        }
-    }
-
-    pub(super) fn publish_plan(&self, planned: Result<PlannedPrimitive, String>, id: ProposalId) {
-        let header = std_msgs::Header {
-            stamp: self.node.now(),
-            frame_id: self.parameters.world_frame.clone(),
-        };
-        match planned_motion(planned, id.0, &self.work_cell.joint_names, header) {
-            Ok(motion) => self.planned.publish(motion),
-            Err(error) => warn!("the motion of proposal {id}: {error}"),
-        }
-    }
-
     pub(super) fn on_confirmation(&mut self, message: sctn_msgs::StepConfirmation) {
-        // What was sent before it is to be known before it.
+        // DDS may deliver messages of several topics in another order than they were sent: take what has arrived first.
         while let Some(heightmap) = self.heightmaps.try_recv() {
             self.on_heightmap(heightmap);
         }
@@ -102,6 +66,14 @@ impl Executor<'_> {
         if self.plant_at_confirmation(id, decision) {
             return;
         }
+        if let Err(refusal) = self
+            .gate
+            .check_operator(id, decision, &message.operator_name)
+            && !is_planted(Planted::AnyOperator)
+        {
+            self.report(self.refusal(id, refusal.to_string()), None);
+            return;
+        }
         self.confirm(id, decision);
     }
 
@@ -113,6 +85,7 @@ impl Executor<'_> {
         let (robot, now) = (self.robot(), self.origin.elapsed());
         let actions = self.gate.on_confirmation(id, decision, &robot, now);
         self.act(actions);
+        self.rehearse_next();
     }
 
     /// Confirmations whose proposal or heightmap was still on its way.
@@ -127,6 +100,7 @@ impl Executor<'_> {
             match action {
                 GateAction::Move(proposal) => self.begin(*proposal),
                 GateAction::GoHome(id) => self.begin_home(id),
+                GateAction::PutDown(id) => self.begin_put_down(id),
                 GateAction::Cancel => {
                     if let Some(motion) = &mut self.motion {
                         motion.stop(StopCause::Operator);

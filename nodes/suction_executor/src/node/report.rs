@@ -8,7 +8,6 @@ use step_protocol::{ProposalId, Report, StepOutcome, StepResult};
 use tracing::{error, info, warn};
 
 use super::Executor;
-use super::motion::Cause;
 
 impl Executor<'_> {
     /// A refusal with where the proposal stands.
@@ -47,7 +46,7 @@ impl Executor<'_> {
         report: Report,
         motion: Option<(Duration, Duration)>,
     ) -> sctn_msgs::StepResult {
-        let now = Duration::from_nanos(self.node.clock().now_ns().max(0) as u64);
+        let now = self.node.clock().time();
         let (stamp, duration) = motion.unwrap_or((now, Duration::ZERO));
         let result = StepResult {
             stamp,
@@ -79,8 +78,7 @@ impl Executor<'_> {
         // What an operator's approval has led to.
         let motion = match self.motion.as_ref().map(|motion| motion.cause) {
             None => "at rest".to_owned(),
-            Some(Cause::Home(_)) => "goes home".to_owned(),
-            Some(Cause::Proposal(id)) => format!("carries out proposal {id}"),
+            Some(cause) => cause.text(),
         };
         diagnostics.set("motion", Level::Ok, motion, []);
     }

@@ -76,6 +76,28 @@ use crate::{
 #[cfg(not(feature = "security"))]
 use crate::no_security::*;
 
+// What a participant says of endpoints counts only where they are its own. Else
+// anybody with a certificate could announce endpoints of another one, with the
+// permissions of that one.
+#[cfg(feature = "security")]
+fn said_of_itself<D: crate::Keyed<K = Endpoint_GUID>>(
+  sample: crate::with_key::DataSample<D>,
+  endpoint: impl Fn(&D) -> GUID,
+) -> Option<Sample<D, GUID>> {
+  let sender = sample.sample_info().writer_guid().prefix;
+  let sample = sample.into_value().map_dispose(|key| key.0);
+  let subject = match &sample {
+    Sample::Value(data) => endpoint(data),
+    Sample::Dispose(guid) => *guid,
+  };
+  if subject.prefix == sender {
+    Some(sample)
+  } else {
+    warn!("Participant {sender:?} speaks of {subject:?}, which is not its own. Ignoring it.");
+    None
+  }
+}
+
 #[derive(Clone, Eq, PartialEq, Ord, PartialOrd, Hash)]
 pub enum DiscoveryCommand {
   StopDiscovery,
@@ -1325,7 +1347,7 @@ impl Discovery {
     let ts: Vec<Sample<(DiscoveredTopicData, GUID), GUID>> = match self
       .dcps_topic
       .reader
-      .take(usize::MAX, ReadCondition::any())
+      .take(usize::MAX, ReadCondition::not_read())
     {
       Ok(ds) => ds
         .iter()
@@ -1407,7 +1429,7 @@ impl Discovery {
     let mut samples = match self
       .dcps_participant_message
       .reader
-      .take(usize::MAX, ReadCondition::any())
+      .take(usize::MAX, ReadCondition::not_read())
     {
       Ok(nonsecure_samples) => nonsecure_samples,
       Err(e) => {
@@ -1423,7 +1445,7 @@ impl Discovery {
     let mut secure_samples = match self
       .dcps_participant_message_secure
       .reader
-      .take(usize::MAX, ReadCondition::any())
+      .take(usize::MAX, ReadCondition::not_read())
     {
       Ok(secure_samples) => secure_samples,
       Err(e) => {
@@ -1604,11 +1626,12 @@ impl Discovery {
       match self
         .dcps_participant_volatile_message_secure
         .reader
-        .into_iterator()
+        .take(usize::MAX, ReadCondition::not_read())
       {
-        Ok(dr_iter) => {
-          for msg in dr_iter {
-            security.volatile_message_secure_read(&msg);
+        Ok(samples) => {
+          for sample in samples {
+            let sender = sample.sample_info().writer_guid().prefix;
+            security.volatile_message_secure_read(sample.value(), sender);
           }
         }
         Err(e) => {
@@ -1658,11 +1681,16 @@ impl Discovery {
   #[cfg(feature = "security")]
   pub fn secure_sedp_receive_subscription(&mut self, _read_history: Option<GuidPrefix>) {
     let sec_subs: Vec<Sample<SubscriptionBuiltinTopicDataSecure, GUID>> =
-      match self.dcps_subscriptions_secure.reader.into_iterator() {
-        // into_iterator() took these samples out of the reader, so all of them
+      match self
+        .dcps_subscriptions_secure
+        .reader
+        .take(usize::MAX, ReadCondition::not_read())
+      {
+        // take() took these samples out of the reader, so all of them
         // must be processed.
         Ok(ds) => ds
-          .map(|d| d.map_dispose(|g| g.0)) // map_dispose removes Endpoint_GUID wrapper around GUID
+          .into_iter()
+          .filter_map(|d| said_of_itself(d, |d| d.discovered_reader_data.reader_proxy.remote_reader_guid))
           .collect(),
         Err(e) => {
           error!("secure_sedp_receive_subscription: {e:?}");
@@ -1705,11 +1733,16 @@ impl Discovery {
   #[cfg(feature = "security")]
   pub fn secure_sedp_receive_publication(&mut self, _read_history: Option<GuidPrefix>) {
     let sec_pubs: Vec<Sample<PublicationBuiltinTopicDataSecure, GUID>> =
-      match self.dcps_publications_secure.reader.into_iterator() {
-        // into_iterator() took these samples out of the reader, so all of them
+      match self
+        .dcps_publications_secure
+        .reader
+        .take(usize::MAX, ReadCondition::not_read())
+      {
+        // take() took these samples out of the reader, so all of them
         // must be processed.
         Ok(ds) => ds
-          .map(|d| d.map_dispose(|g| g.0)) // map_dispose removes Endpoint_GUID wrapper around GUID
+          .into_iter()
+          .filter_map(|d| said_of_itself(d, |d| d.discovered_writer_data.writer_proxy.remote_writer_guid))
           .collect(),
         Err(e) => {
           error!("secure_sedp_receive_publication: {e:?}");

@@ -43,7 +43,7 @@ use crate::{
     guid::{EntityId, GuidPrefix},
   },
   with_key::{self, DataWriterCdr},
-  RepresentationIdentifier, SequenceNumber, GUID,
+  RepresentationIdentifier, SequenceNumber, Timestamp, GUID,
 };
 use super::{
   discovery::{DataWriterPlCdr, NormalDiscoveryPermission},
@@ -107,7 +107,9 @@ pub(crate) struct SecureDiscovery {
 
   // In the key, first GUID is local endpoint's, second is remote endpoint's
   cached_received_key_exchange_messages: HashMap<(GUID, GUID), ParticipantVolatileMessageSecure>,
-  user_data_endpoints_with_keys_already_sent_to: HashSet<GUID>,
+  // Local endpoint's GUID, then that of the remote: several local endpoints may
+  // match one remote, and each has keys of its own.
+  user_data_endpoints_with_keys_already_sent_to: HashSet<(GUID, GUID)>,
 
   // A set for keeping track which remote readers are relay-only
   relay_only_remote_readers: HashSet<GUID>,
@@ -879,7 +881,7 @@ impl SecureDiscovery {
 
     if do_secure_write {
       let sec_sub_data = SubscriptionBuiltinTopicDataSecure::from((*local_user_reader).clone());
-      if let Err(e) = secure_sub_writer.write(sec_sub_data, None) {
+      if let Err(e) = secure_sub_writer.write(sec_sub_data, Some(Timestamp::now())) {
         error!("Failed to write subscription to DCPSSubscriptionsSecure: {e}");
       } else {
         security_info!(
@@ -890,7 +892,9 @@ impl SecureDiscovery {
       }
     } else {
       // Do a non-secure write
-      if let Err(e) = nonsecure_sub_writer.write((*local_user_reader).clone(), None) {
+      if let Err(e) =
+        nonsecure_sub_writer.write((*local_user_reader).clone(), Some(Timestamp::now()))
+      {
         error!("Failed to write subscription to DCPSSubscriptions: {e}");
       } else {
         debug!(
@@ -922,7 +926,7 @@ impl SecureDiscovery {
 
     if do_secure_write {
       let sec_pub_data = PublicationBuiltinTopicDataSecure::from((*local_user_writer).clone());
-      if let Err(e) = secure_pub_writer.write(sec_pub_data, None) {
+      if let Err(e) = secure_pub_writer.write(sec_pub_data, Some(Timestamp::now())) {
         error!("Failed to write publication to DCPSPublicationsSecure: {e}");
       } else {
         security_info!(
@@ -933,7 +937,9 @@ impl SecureDiscovery {
       }
     } else {
       // Do a non-secure write
-      if let Err(e) = nonsecure_pub_writer.write((*local_user_writer).clone(), None) {
+      if let Err(e) =
+        nonsecure_pub_writer.write((*local_user_writer).clone(), Some(Timestamp::now()))
+      {
         error!("Failed to write publication to DCPSPublications: {e}");
       } else {
         debug!(
@@ -1913,7 +1919,25 @@ impl SecureDiscovery {
     }
   }
 
-  pub fn volatile_message_secure_read(&mut self, msg: &ParticipantVolatileMessageSecure) {
+  // `sender` is the participant whose keys the message was protected with.
+  pub fn volatile_message_secure_read(
+    &mut self,
+    msg: &ParticipantVolatileMessageSecure,
+    sender: GuidPrefix,
+  ) {
+    // A participant gives its own keys only. Else anybody with a certificate could
+    // replace the keys of another one, and speak as that one.
+    let source_endpoint = msg.generic.source_endpoint_guid;
+    if msg.generic.source_guid_prefix() != sender
+      || (source_endpoint != GUID::GUID_UNKNOWN && source_endpoint.prefix != sender)
+    {
+      security_warn!(
+        "Participant {sender:?} sent keys of {:?} and {source_endpoint:?}. Ignoring them.",
+        msg.generic.source_guid_prefix()
+      );
+      return;
+    }
+
     // Check is the message meant to us (see 7.4.4.4 Destination of the
     // ParticipantVolatileMessageSecure of the spec)
     let dest_guid = msg.generic.destination_participant_guid;
@@ -2372,21 +2396,23 @@ impl SecureDiscovery {
     // See if we have already sent our keys. Do nothing if so.
     let we_have_sent_ours = self
       .user_data_endpoints_with_keys_already_sent_to
-      .contains(&remote_endpoint_guid);
+      .contains(&(local_endpoint_guid, remote_endpoint_guid));
     if we_have_sent_ours {
       return;
     }
 
-    // Dig out remote's security attributes
+    // Dig out remote's security attributes. It may be an endpoint of our own.
+    let db = discovery_db_read(discovery_db);
     let sec_info_opt = if remote_is_writer {
-      discovery_db_read(discovery_db)
-        .get_topic_writer(&remote_endpoint_guid)
+      db.get_topic_writer(&remote_endpoint_guid)
+        .or_else(|| db.get_local_topic_writer(remote_endpoint_guid))
         .map(|writer| writer.publication_topic_data.security_info().clone())
     } else {
-      discovery_db_read(discovery_db)
-        .get_topic_reader(&remote_endpoint_guid)
+      db.get_topic_reader(&remote_endpoint_guid)
+        .or_else(|| db.get_local_topic_reader(remote_endpoint_guid))
         .map(|reader| reader.subscription_topic_data.security_info().clone())
     };
+    drop(db);
 
     let sec_attr = match sec_info_opt.flatten() {
       Some(info) => EndpointSecurityAttributes::from(info),
@@ -2421,7 +2447,7 @@ impl SecureDiscovery {
       // Mark as if we have sent keys to the remote
       self
         .user_data_endpoints_with_keys_already_sent_to
-        .insert(remote_endpoint_guid);
+        .insert((local_endpoint_guid, remote_endpoint_guid));
       return;
     }
 
@@ -2520,7 +2546,7 @@ impl SecureDiscovery {
     // Remember that we have successfully sent the keys
     self
       .user_data_endpoints_with_keys_already_sent_to
-      .insert(remote_endpoint_guid);
+      .insert((local_endpoint_guid, remote_endpoint_guid));
   }
 
   fn validate_remote_participant_permissions(

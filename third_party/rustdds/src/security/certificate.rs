@@ -17,102 +17,130 @@
 // Permissions documents. The verification of the two can use the same or
 // different Certificate instances.
 
-#[allow(unused_imports)]
-use log::{debug, error, info, trace, warn};
+use std::time::SystemTime;
+
 use bytes::Bytes;
-use x509_certificate::{
-  certificate::CapturedX509Certificate, EcdsaCurve, KeyAlgorithm, SignatureAlgorithm,
+use der::{
+  asn1::{Any, BitString, ObjectIdentifier},
+  pem::{self, LineEnding},
+  Decode, Encode, Sequence,
 };
-use der::Decode;
-use bcder::{encode::Values, Mode};
 
 use crate::security::{
-  authentication::authentication_builtin::types::{
-    CertificateAlgorithm, ECDSA_SIGNATURE_ALGO_NAME, RSA_2048_KEY_LENGTH, RSA_SIGNATURE_ALGO_NAME,
-  },
-  config::{to_config_error_other, to_config_error_parse, ConfigError},
+  access_control::access_control_builtin::pkcs7_signed_data::AlgorithmIdentifier,
+  authentication::authentication_builtin::types::ECDSA_SIGNATURE_ALGO_NAME,
+  config::{parse_config_error, to_config_error_parse, ConfigError},
   types::{security_error, SecurityResult},
 };
 
-// This is mostly a wrapper around
-// x509_certificate::certificate::CapturedX509Certificate
-// so that we can keep track of what operations we use.
+const EC_PUBLIC_KEY: ObjectIdentifier = ObjectIdentifier::new_unwrap("1.2.840.10045.2.1");
+const PRIME256V1: ObjectIdentifier = ObjectIdentifier::new_unwrap("1.2.840.10045.3.1.7");
+const ECDSA_WITH_SHA256: ObjectIdentifier = ObjectIdentifier::new_unwrap("1.2.840.10045.4.3.2");
+
+// RFC 5280 Certificate. What is signed are the bytes of the first part, so it is
+// kept as it is.
+#[derive(Sequence)]
+struct SignedCertificate {
+  tbs_certificate: Any,
+  signature_algorithm: AlgorithmIdentifier,
+  signature: BitString,
+}
+
+/// An X.509 certificate of an ECDSA key over the curve P-256, signed by such a
+/// key with SHA-256. The other algorithm of DDS Security, RSA, is refused.
 #[derive(Clone, Debug)]
 pub struct Certificate {
-  cert: CapturedX509Certificate,
+  pem: String,
+  tbs_certificate: Bytes,
+  signature: Bytes,
+  public_key: Bytes,
+  issuer_der: Vec<u8>,
+  subject_der: Vec<u8>,
   subject_name: DistinguishedName,
+  not_before: SystemTime,
+  not_after: SystemTime,
 }
 
 impl Certificate {
   pub fn from_pem(pem_data: impl AsRef<[u8]>) -> Result<Self, ConfigError> {
-    let cert = CapturedX509Certificate::from_pem(pem_data)
+    let (label, der) = pem::decode_vec(pem_data.as_ref())
+      .map_err(to_config_error_parse("Cannot read the PEM of a certificate"))?;
+    if label != "CERTIFICATE" {
+      return Err(parse_config_error(format!(
+        "Expected PEM of a CERTIFICATE, found {label}"
+      )));
+    }
+    let parts = SignedCertificate::from_der(&der)
       .map_err(to_config_error_parse("Cannot read X.509 Certificate"))?;
-
-    let other_cert = x509_cert::certificate::Certificate::from_der(cert.constructed_data())
+    let certificate = x509_cert::certificate::Certificate::from_der(&der)
       .map_err(to_config_error_parse("Cannot read X.509 Certificate(2)"))?;
+    let certificate = certificate.tbs_certificate();
 
-    let subject_name = other_cert.tbs_certificate().subject().clone().into();
+    let key = certificate.subject_public_key_info();
+    let curve = key
+      .algorithm
+      .parameters
+      .as_ref()
+      .and_then(|parameters| parameters.decode_as::<ObjectIdentifier>().ok());
+    if key.algorithm.oid != EC_PUBLIC_KEY || curve != Some(PRIME256V1) {
+      return Err(parse_config_error(format!(
+        "Certificate of {}: expected an ECDSA key over P-256 (prime256v1)",
+        certificate.subject()
+      )));
+    }
+    if parts.signature_algorithm.oid != ECDSA_WITH_SHA256 {
+      return Err(parse_config_error(format!(
+        "Certificate of {}: expected a signature by ECDSA with SHA-256, found algorithm {}",
+        certificate.subject(),
+        parts.signature_algorithm.oid
+      )));
+    }
 
-    Ok(Certificate { cert, subject_name })
+    let encode = to_config_error_parse("Cannot encode a part of the certificate");
+    let encoded = (|| {
+      Ok::<_, der::Error>((
+        parts.tbs_certificate.to_der()?,
+        certificate.issuer().to_der()?,
+        certificate.subject().to_der()?,
+        pem::encode_string("CERTIFICATE", LineEnding::LF, &der)?,
+      ))
+    })();
+    let (tbs_certificate, issuer_der, subject_der, pem) = encoded.map_err(encode)?;
+
+    Ok(Certificate {
+      pem,
+      tbs_certificate: tbs_certificate.into(),
+      signature: Bytes::copy_from_slice(parts.signature.raw_bytes()),
+      public_key: Bytes::copy_from_slice(key.subject_public_key.raw_bytes()),
+      issuer_der,
+      subject_der,
+      subject_name: certificate.subject().clone().into(),
+      not_before: certificate.validity().not_before.to_system_time(),
+      not_after: certificate.validity().not_after.to_system_time(),
+    })
   }
 
   pub fn to_pem(&self) -> String {
-    self.cert.encode_pem()
+    self.pem.clone()
   }
 
-  // public key algorithm
-  pub fn key_algorithm(&self) -> Option<x509_certificate::KeyAlgorithm> {
-    self.cert.key_algorithm()
+  pub fn public_key(&self) -> &[u8] {
+    &self.public_key
   }
 
   // name of the signature algoritm as a byte string accrding to Table 49
   // in DDS Security Spec v1.1 Section "9.3.2.5.1 HandshakeRequestMessageToken
   // objects"
-  pub fn signature_algorithm_identifier(&self) -> SecurityResult<Bytes> {
-    match self.cert.signature_algorithm() {
-      None => Err(security_error(
-        "Certificate has no known signature algorithm?!",
-      )),
-      Some(SignatureAlgorithm::RsaSha256) => Ok(Bytes::from_static(RSA_SIGNATURE_ALGO_NAME)),
-      Some(SignatureAlgorithm::EcdsaSha256) => Ok(Bytes::from_static(ECDSA_SIGNATURE_ALGO_NAME)),
-      Some(x) => Err(security_error(&format!(
-        "Certificate has out-of-spec signature algorithm {x:?}"
-      ))),
-    }
+  pub fn signature_algorithm_identifier(&self) -> Bytes {
+    Bytes::from_static(ECDSA_SIGNATURE_ALGO_NAME)
   }
 
   pub fn subject_name(&self) -> &DistinguishedName {
     &self.subject_name
   }
 
-  pub fn subject_name_der(&self) -> Result<Vec<u8>, ConfigError> {
-    let er = &self.cert.subject_name().encode_ref();
-    let mut buf = Vec::with_capacity(er.encoded_len(Mode::Der));
-    er.write_encoded(Mode::Der, &mut buf)
-      .map_err(to_config_error_other(
-        "Cannot extract subject_name DER encoding",
-      ))?;
-    Ok(buf)
-  }
-
-  pub(super) fn algorithm(&self) -> Option<CertificateAlgorithm> {
-    let key_algorithm = &self.cert.key_algorithm();
-    match key_algorithm {
-      Some(KeyAlgorithm::Rsa) => {
-        let key_length = self.cert.public_key_data().len();
-        if key_length == RSA_2048_KEY_LENGTH {
-          Some(CertificateAlgorithm::RSA2048)
-        } else {
-          log::error!("Wrong RSA key length: expected {RSA_2048_KEY_LENGTH}, got {key_length}");
-          None
-        }
-      }
-      Some(KeyAlgorithm::Ecdsa(EcdsaCurve::Secp256r1)) => Some(CertificateAlgorithm::ECPrime256v1),
-      _ => {
-        log::error!("Unknown key algorithm. cert.key_algorithm returned {key_algorithm:?}");
-        None
-      }
-    }
+  pub fn subject_name_der(&self) -> &[u8] {
+    &self.subject_der
   }
 
   pub fn verify_signed_data_with_algorithm(
@@ -121,25 +149,42 @@ impl Certificate {
     signature: impl AsRef<[u8]>,
     verify_algorithm: &'static dyn ring::signature::VerificationAlgorithm,
   ) -> SecurityResult<()> {
-    self
-      .cert
-      .verify_signed_data_with_algorithm(signed_data, signature, verify_algorithm)
-      .map_err(|e| security_error(&format!("Signature verification failure: {e:?}")))
+    ring::signature::UnparsedPublicKey::new(verify_algorithm, &self.public_key)
+      .verify(signed_data.as_ref(), signature.as_ref())
+      .map_err(|_| security_error("Signature verification failure"))
   }
 
-  // Verify that `self` was signed by `other` Certificate
-  // e.g.
+  // Verify that `self` was signed by `other` Certificate, and that both are valid
+  // now, e.g.
   // `someones_identity.verify_signed_by_certificate( certificate_authority )`
   //
   pub fn verify_signed_by_certificate(&self, other: &Certificate) -> SecurityResult<()> {
-    self
-      .cert
-      .verify_signed_by_certificate(&other.cert)
-      .map_err(|e| {
-        security_error(&format!(
-          "Certificate signature verification failure: {e:?}"
-        ))
-      })
+    if self.issuer_der != other.subject_der {
+      return Err(security_error(&format!(
+        "Certificate of {} was not issued by {}",
+        self.subject_name, other.subject_name
+      )));
+    }
+    other.verify_signed_data_with_algorithm(
+      &self.tbs_certificate,
+      &self.signature,
+      &ring::signature::ECDSA_P256_SHA256_ASN1,
+    )?;
+    self.verify_validity()?;
+    other.verify_validity()
+  }
+
+  fn verify_validity(&self) -> SecurityResult<()> {
+    let now = SystemTime::now();
+    if now < self.not_before || self.not_after < now {
+      return Err(security_error(&format!(
+        "Certificate of {} is not valid now, but from {} to {}",
+        self.subject_name,
+        chrono::DateTime::<chrono::Utc>::from(self.not_before),
+        chrono::DateTime::<chrono::Utc>::from(self.not_after)
+      )));
+    }
+    Ok(())
   }
 }
 

@@ -4,59 +4,22 @@ use std::{
 };
 
 use crate::{
-  qos, security,
-  security::{
-    authentication::authentication_builtin::types::CertificateAlgorithm, private_key::PrivateKey,
-  },
+  create_security_error_and_log, qos, security,
+  security::{certificate::Certificate, private_key::PrivateKey, SecurityError, SecurityResult},
 };
 use super::{
-  access_control::access_control_builtin::types::{
-    QOS_GOVERNANCE_DOCUMENT_PROPERTY_NAME, QOS_PERMISSIONS_CERTIFICATE_PROPERTY_NAME,
-    QOS_PERMISSIONS_DOCUMENT_PROPERTY_NAME,
+  access_control::access_control_builtin::{
+    s_mime_config_parser::SignedDocument,
+    types::{
+      QOS_GOVERNANCE_DOCUMENT_PROPERTY_NAME, QOS_PERMISSIONS_CERTIFICATE_PROPERTY_NAME,
+      QOS_PERMISSIONS_DOCUMENT_PROPERTY_NAME,
+    },
   },
   authentication::authentication_builtin::types::{
     QOS_IDENTITY_CA_PROPERTY_NAME, QOS_IDENTITY_CERTIFICATE_PROPERTY_NAME,
-    QOS_PASSWORD_PROPERTY_NAME, QOS_PRIVATE_KEY_PROPERTY_NAME,
+    QOS_PRIVATE_KEY_PROPERTY_NAME,
   },
 };
-
-/// How to access Certificate's private key for signing.
-pub enum PrivateSigningKey {
-  /// Private key is stored in a regular .pem file. The contents may be
-  /// encrypted with a pasword.
-  Files {
-    /// Where the PEM file is stored
-    file_path: PathBuf,
-    /// Decryption key, if private key file is encrypted
-    file_password: String,
-  },
-  /// The private key is held by a PKCS11 Hardware Security Module, which
-  /// typically refuses to output the key.
-  /// Signing operations are done by the HSM.
-  ///
-  /// Note: Currently, we do not implement any mechanism for choosing an object
-  /// within the selected token. We just choose the first suitable object
-  /// within the token. Suitable is recognized by object attributes:
-  /// ObjectClass = PRIVATE_KEY and Sign = true.
-  ///
-  /// Obviously, this does not work for a use case where a single token contains
-  /// several private key objects, and one of those would have to be chosen.
-  Pkcs11 {
-    /// Dynamic library file for accessing the HSM, e.g.
-    /// "/usr/lib/softhsm/libsofthsm2.so". Use absolute path.
-    hsm_access_library: PathBuf,
-
-    /// Label of the token to use. Label is defined in PKCS#11 spec Section "3.2
-    /// Slot and token types" definition of CK_TOKEN_INFO.
-    token_label: String,
-
-    /// Login PIN code to operate the token, if any.
-    /// Despite the name, the PIN is alphanumeric.
-    /// It is used to attempt a read-only login as "user" (not Security
-    /// Officer).
-    token_pin: Option<String>,
-  },
-}
 
 /// This holds the paths to files that configure DDS Security.
 pub struct DomainParticipantSecurityConfigFiles {
@@ -64,8 +27,8 @@ pub struct DomainParticipantSecurityConfigFiles {
   pub identity_ca_certificate: PathBuf,
   /// Identity docuemnt for this Participant
   pub participant_identity_certificate: PathBuf,
-  /// Private (signing) key for this participant
-  pub participant_identity_private_key: PrivateSigningKey,
+  /// Private (signing) key for this participant: a PEM file, not encrypted
+  pub participant_identity_private_key: PathBuf,
   /// CA that is used to validate permissions documents. May be the same as
   /// Identity CA above.
   pub permissions_ca_certificate: PathBuf,
@@ -78,10 +41,11 @@ pub struct DomainParticipantSecurityConfigFiles {
 }
 
 impl DomainParticipantSecurityConfigFiles {
-  /// Assign some default names to security config files.
+  /// Assign some default names to security config files. The private key is not
+  /// encrypted: a password is of no use.
   pub fn with_ros_default_names(
     security_config_dir: impl AsRef<Path>,
-    private_key_password: String,
+    _private_key_password: String,
   ) -> Self {
     let d = security_config_dir;
 
@@ -90,35 +54,7 @@ impl DomainParticipantSecurityConfigFiles {
     DomainParticipantSecurityConfigFiles {
       identity_ca_certificate: own_and_append(&d, "identity_ca.cert.pem"),
       participant_identity_certificate: own_and_append(&d, "cert.pem"),
-      participant_identity_private_key: PrivateSigningKey::Files {
-        file_path: own_and_append(&d, "key.pem"),
-        file_password: private_key_password,
-      },
-      permissions_ca_certificate: own_and_append(&d, "permissions_ca.cert.pem"),
-      domain_governance_document: own_and_append(&d, "governance.p7s"),
-      participant_permissions_document: own_and_append(&d, "permissions.p7s"),
-      certificate_revocation_list: None, // "crl.pem"
-    }
-  }
-
-  pub fn with_ros_default_names_and_hsm(
-    security_config_dir: impl AsRef<Path>,
-    hsm_access_library: impl AsRef<Path>,
-    token_label: String,
-    token_pin: Option<String>,
-  ) -> Self {
-    let d = security_config_dir;
-
-    // The default names are taken from
-    // https://github.com/ros2/rmw_dds_common/blob/6fae970a99c3d4e0684a6e987edb89505b8ee213/rmw_dds_common/src/security.cpp#L25
-    DomainParticipantSecurityConfigFiles {
-      identity_ca_certificate: own_and_append(&d, "identity_ca.cert.pem"),
-      participant_identity_certificate: own_and_append(&d, "cert.pem"),
-      participant_identity_private_key: PrivateSigningKey::Pkcs11 {
-        hsm_access_library: own_and_append("", hsm_access_library),
-        token_label,
-        token_pin,
-      },
+      participant_identity_private_key: own_and_append(&d, "key.pem"),
       permissions_ca_certificate: own_and_append(&d, "permissions_ca.cert.pem"),
       domain_governance_document: own_and_append(&d, "governance.p7s"),
       participant_permissions_document: own_and_append(&d, "permissions.p7s"),
@@ -127,35 +63,16 @@ impl DomainParticipantSecurityConfigFiles {
   }
 
   pub fn into_property_policy(self) -> qos::policy::Property {
-    let mut value = vec![
+    let value = vec![
       mk_file_prop(QOS_IDENTITY_CA_PROPERTY_NAME, &self.identity_ca_certificate),
       mk_file_prop(
         QOS_IDENTITY_CERTIFICATE_PROPERTY_NAME,
         &self.participant_identity_certificate,
       ),
-      match self.participant_identity_private_key {
-        PrivateSigningKey::Files { ref file_path, .. } => {
-          mk_file_prop(QOS_PRIVATE_KEY_PROPERTY_NAME, file_path)
-        }
-        PrivateSigningKey::Pkcs11 {
-          ref token_label,
-          ref token_pin,
-          ref hsm_access_library,
-        } => {
-          // for example
-          // pkcs11:object=my_private_key_name?pin-value=OpenSesame&module-path=/usr/lib/
-          // libhsm.so
-          let mut pkcs11_uri = format!("pkcs11:object={token_label}");
-          if let Some(pin) = token_pin {
-            pkcs11_uri.push_str(&format!(
-              "?pin-value={}&module-path={}",
-              pin,
-              hsm_access_library.display()
-            ));
-          }
-          mk_string_prop(QOS_PRIVATE_KEY_PROPERTY_NAME, pkcs11_uri)
-        }
-      },
+      mk_file_prop(
+        QOS_PRIVATE_KEY_PROPERTY_NAME,
+        &self.participant_identity_private_key,
+      ),
       mk_file_prop(
         QOS_PERMISSIONS_CERTIFICATE_PROPERTY_NAME,
         &self.permissions_ca_certificate,
@@ -169,9 +86,6 @@ impl DomainParticipantSecurityConfigFiles {
         &self.participant_permissions_document,
       ),
     ];
-    if let PrivateSigningKey::Files { file_password, .. } = self.participant_identity_private_key {
-      value.push(mk_string_prop(QOS_PASSWORD_PROPERTY_NAME, file_password));
-    }
 
     qos::policy::Property {
       value,
@@ -197,63 +111,80 @@ fn mk_file_prop(name: &str, file_path: impl AsRef<Path>) -> security::types::Pro
   }
 }
 
-fn mk_string_prop(name: &str, value: String) -> security::types::Property {
-  security::types::Property {
-    name: name.to_string(),
-    value,
-    propagate: false,
-  }
-}
-
 use bytes::Bytes;
 
 pub(crate) fn read_uri(uri: &str) -> Result<Bytes, ConfigError> {
   match uri.split_once(':') {
     Some(("data", content)) => Ok(Bytes::copy_from_slice(content.as_bytes())),
-    Some(("pkcs11", _)) => Err(other_config_error(
-      "Config URI schema 'pkcs11:' not implemented.".to_owned(),
-    )),
     Some(("file", path)) => std::fs::read(path)
       .map_err(to_config_error_other(&format!("I/O error reading {path}")))
       .map(Bytes::from),
     _ => Err(parse_config_error(
-      "Config URI must begin with 'file:' , 'data:', or 'pkcs11:'.".to_owned(),
+      "Config URI must begin with 'file:' or 'data:'.".to_owned(),
     )),
   }
 }
 
-//use crate::security::certificate::Certificate;
-
-pub(in crate::security) fn read_uri_to_private_key(
-  uri: &str,
-  key_algorithm: CertificateAlgorithm,
-) -> Result<PrivateKey, ConfigError> {
-  match uri.split_once(':') {
-    Some(("data", content)) => PrivateKey::from_pem(Bytes::copy_from_slice(content.as_bytes())),
-
-    Some(("pkcs11", path_and_query)) => {
-      // These URIs are composed of "pkcs11" ":" path [ "?" query ]
-      PrivateKey::from_pkcs11_uri_path_and_query(path_and_query, key_algorithm)
-    }
-    Some(("file", path)) => std::fs::read(path)
-      .map_err(to_config_error_other(&format!("I/O error reading {path}")))
-      .map(Bytes::from)
-      .and_then(PrivateKey::from_pem),
-    _ => Err(parse_config_error(
-      "Config URI must begin with 'file:' , 'data:', or 'pkcs11:'.".to_owned(),
-    )),
-  }
+/// A certificate of the security configuration; errors name its file.
+pub(in crate::security) fn read_certificate(
+  qos: &qos::QosPolicies,
+  property: &str,
+) -> SecurityResult<Certificate> {
+  let uri = qos.get_property(property)?;
+  read_uri(&uri)
+    .and_then(Certificate::from_pem)
+    .map_err(|e| create_security_error_and_log!("{uri}: {e}"))
 }
 
-use std::fmt::Debug;
+/// A signed document of the security configuration, as it is and what it says;
+/// errors name its file.
+pub(in crate::security) fn read_signed_document<T>(
+  qos: &qos::QosPolicies,
+  property: &str,
+  signer: &Certificate,
+  parse: impl Fn(&str) -> Result<T, ConfigError>,
+) -> SecurityResult<(Bytes, T)> {
+  let uri = qos.get_property(property)?;
+  let named = |e: &dyn fmt::Display| create_security_error_and_log!("{uri}: {e}");
+  let signed = read_uri(&uri).map_err(|e| named(&e))?;
+  let content = SignedDocument::from_bytes(&signed)
+    .map_err(|e| named(&e))?
+    .verify_signature(signer)
+    .map(|content| String::from_utf8_lossy(content.as_ref()).into_owned())
+    .map_err(|e| named(&e.msg))?;
+  let parsed = parse(&content).map_err(|e| named(&e))?;
+  Ok((signed, parsed))
+}
+
+pub(in crate::security) fn read_private_key(
+  qos: &qos::QosPolicies,
+  property: &str,
+) -> SecurityResult<PrivateKey> {
+  let uri = qos.get_property(property)?;
+  read_uri(&uri)
+    .and_then(PrivateKey::from_pem)
+    .map_err(|e| create_security_error_and_log!("{uri}: {e}"))
+}
+
+use std::fmt::{self, Debug};
 
 #[derive(Debug)]
 pub enum ConfigError {
   Parse(String),
   Pkcs7(String),
-  Pkcs11(String),
   Security(String),
   Other(String),
+}
+
+impl fmt::Display for ConfigError {
+  fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+    match self {
+      ConfigError::Parse(text)
+      | ConfigError::Pkcs7(text)
+      | ConfigError::Security(text)
+      | ConfigError::Other(text) => f.write_str(text),
+    }
+  }
 }
 
 impl From<glob::PatternError> for ConfigError {
@@ -265,12 +196,6 @@ impl From<glob::PatternError> for ConfigError {
 impl From<serde_xml_rs::Error> for ConfigError {
   fn from(e: serde_xml_rs::Error) -> ConfigError {
     ConfigError::Parse(format!("XML parse error: {e:?}"))
-  }
-}
-
-impl From<cryptoki::error::Error> for ConfigError {
-  fn from(e: cryptoki::error::Error) -> ConfigError {
-    ConfigError::Pkcs11(format!("PKCS11 hardware security module error: {e:?}"))
   }
 }
 

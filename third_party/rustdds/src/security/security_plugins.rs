@@ -1332,43 +1332,21 @@ impl SecurityPlugins {
 #[derive(Clone)]
 pub(crate) struct SecurityPluginsHandle {
   inner: Arc<Mutex<SecurityPlugins>>,
-  who_has_it: Arc<Mutex<Option<String>>>,
 }
 
 impl SecurityPluginsHandle {
   pub(crate) fn new(s: SecurityPlugins) -> Self {
     Self {
       inner: Arc::new(Mutex::new(s)),
-      who_has_it: Arc::new(Mutex::new(None)),
     }
   }
 
   pub(crate) fn get_plugins(&self) -> MutexGuard<'_, SecurityPlugins> {
-    let mut count = 0;
-    loop {
-      match self.try_lock() {
-        Ok(guard) => {
-          *self.who_has_it.lock().unwrap() = std::thread::current().name().map(|s| s.to_owned());
-          return guard;
-        }
-        Err(std::sync::TryLockError::WouldBlock) => {
-          if count > 10 {
-            error!(
-              "I need my lock!! {:?} Looks like {:?} has it.",
-              count,
-              self.who_has_it.lock().unwrap()
-            );
-          }
-          count += 1;
-          std::thread::sleep(std::time::Duration::from_millis(100));
-        }
-        Err(poisoned) => {
-          create_security_error_and_log!("Security plugins are poisoned! {poisoned:?}");
-          panic!("RustDDS internal bug: SecurityPlugins mutex poisoned after a prior panic");
-        }
-      }
-    } // loop
-  } // fn
+    self.lock().unwrap_or_else(|poisoned| {
+      create_security_error_and_log!("Security plugins are poisoned! {poisoned:?}");
+      panic!("RustDDS internal bug: SecurityPlugins mutex poisoned after a prior panic");
+    })
+  }
 }
 
 impl fmt::Debug for SecurityPluginsHandle {

@@ -81,32 +81,6 @@ impl From<ConfigError> for SecurityError {
   }
 }
 
-use x509_certificate::X509CertificateError;
-
-impl From<X509CertificateError> for SecurityError {
-  fn from(e: X509CertificateError) -> Self {
-    SecurityError {
-      msg: format!("X509CertificateError {e:?}"),
-    }
-  }
-}
-
-impl From<openssl::error::ErrorStack> for SecurityError {
-  fn from(e: openssl::error::ErrorStack) -> Self {
-    SecurityError {
-      msg: format!("openssl Error: {e:?}"),
-    }
-  }
-}
-
-impl From<cryptoki::error::Error> for SecurityError {
-  fn from(e: cryptoki::error::Error) -> Self {
-    SecurityError {
-      msg: format!("cryptoki (PKCS#11) Error: {e:?}"),
-    }
-  }
-}
-
 #[doc(hidden)]
 #[macro_export]
 macro_rules! create_security_error_and_log {
@@ -188,14 +162,6 @@ fn get_property(properties: &[Property], property_name: &str) -> SecurityResult<
 }
 
 impl QosPolicies {
-  pub(super) fn get_optional_property(&self, property_name: &str) -> Option<String> {
-    self
-      .property
-      .as_ref()
-      .and_then(|properties_or_binary_properties| {
-        get_optional_property(&properties_or_binary_properties.value, property_name)
-      })
-  }
   pub(super) fn get_property(&self, property_name: &str) -> SecurityResult<String> {
     self
       .property

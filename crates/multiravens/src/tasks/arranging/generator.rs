@@ -88,7 +88,7 @@ pub enum GenerateError {
     File {
         /// The file.
         file: String,
-        /// Why.
+        /// The reason.
         reason: String,
     },
     /// Ranges that nothing fits in.

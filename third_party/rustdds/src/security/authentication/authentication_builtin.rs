@@ -4,7 +4,6 @@ use std::{
 };
 
 use bytes::Bytes;
-use openssl::{bn::BigNum, pkey::Private};
 use ring::agreement;
 
 use crate::{
@@ -13,15 +12,20 @@ use crate::{
     access_control::PermissionsToken, certificate, private_key, security_error, SecurityError,
     SecurityResult,
   },
+  structure::guid::GuidPrefix,
   GUID,
 };
-use self::types::{DH_MODP_KAGREE_ALGO_NAME, ECDH_KAGREE_ALGO_NAME};
+use self::{
+  modp::ModpKey,
+  types::{DH_MODP_KAGREE_ALGO_NAME, ECDH_KAGREE_ALGO_NAME},
+};
 use super::{
   authentication_builtin::types::BuiltinIdentityToken, Challenge, HandshakeHandle, IdentityHandle,
   /* IdentityToken, */ Sha256, SharedSecret,
 };
 
 mod authentication;
+mod modp;
 pub(in crate::security) mod types;
 
 // States for an ongoing handshake with a remote participant. Used by the plugin
@@ -101,7 +105,7 @@ struct LocalParticipantInfo {
 // All things about remote participant that we're interested in
 struct RemoteParticipantInfo {
   //identity_token: IdentityToken,
-  //guid_prefix: GuidPrefix,
+  guid_prefix: GuidPrefix,
   identity_certificate_opt: Option<certificate::Certificate>, /* Not available at first.
                                                                * Obtained from handshake
                                                                * request/reply message */
@@ -116,16 +120,14 @@ struct HandshakeInfo {
   state: BuiltinHandshakeState,
 }
 
-pub enum DHKeys {
-  Modp(openssl::dh::Dh<Private>), // Modular Exponential keys from OpenSSL
+pub(crate) enum DHKeys {
+  Modp(ModpKey),                            // Modular exponential keys
   EC(ring::agreement::EphemeralPrivateKey), // Elliptic Curves keys from ring
 }
 
 impl DHKeys {
-  fn new_modp_keys() -> SecurityResult<Self> {
-    let dh_params = openssl::dh::Dh::get_2048_256()?;
-    let modp_keys = dh_params.generate_key()?;
-    Ok(Self::Modp(modp_keys))
+  fn new_modp_keys(secure_rng: &ring::rand::SystemRandom) -> SecurityResult<Self> {
+    Ok(Self::Modp(ModpKey::generate(secure_rng)?))
   }
 
   fn new_ec_keys(secure_rng: &ring::rand::SystemRandom) -> SecurityResult<Self> {
@@ -134,21 +136,19 @@ impl DHKeys {
   }
 
   fn public_key_bytes(&self) -> SecurityResult<Bytes> {
-    let vec = match self {
-      DHKeys::Modp(openssl_dh) => openssl_dh.public_key().to_vec(),
+    match self {
+      DHKeys::Modp(modp_key) => Ok(modp_key.public_key()),
       DHKeys::EC(ring_dh) => {
         let ring_pub_key = ring_dh.compute_public_key()?;
-        Vec::from(ring_pub_key.as_ref())
+        Ok(Bytes::copy_from_slice(ring_pub_key.as_ref()))
       }
-    };
-    Ok(Bytes::from(vec))
+    }
   }
 
   fn compute_shared_secret(self, remote_dh_public_key: Bytes) -> SecurityResult<SharedSecret> {
     let shared_secret = match self {
-      DHKeys::Modp(openssl_dh) => {
-        let remote_public = BigNum::from_slice(&remote_dh_public_key)?;
-        let secret_key = openssl_dh.compute_key(&remote_public)?;
+      DHKeys::Modp(modp_key) => {
+        let secret_key = modp_key.shared_secret(&remote_dh_public_key)?;
         SharedSecret::from(Sha256::hash(&secret_key))
       }
       DHKeys::EC(ring_dh) => {
@@ -172,12 +172,11 @@ impl DHKeys {
   }
 }
 
-// Implement Debug manually because openssl::dh::Dh<Private> does not implement
-// it
+// Implement Debug manually, so that no private key is printed
 impl std::fmt::Debug for DHKeys {
   fn fmt(&self, f: &mut Formatter<'_>) -> fmt::Result {
     match self {
-      DHKeys::Modp(_dh) => f.debug_struct("Dh<Private>: TODO Debug print").finish(),
+      DHKeys::Modp(_) => f.debug_struct("ModpKey").finish(),
       DHKeys::EC(dh) => dh.fmt(f),
     }
   }

@@ -8,7 +8,10 @@ mod key_material;
 pub(crate) mod types;
 mod validate_receiver_specific_macs;
 
-use std::collections::{HashMap, HashSet};
+use std::{
+  collections::{HashMap, HashSet},
+  sync::atomic::{AtomicU64, Ordering},
+};
 
 use crate::{
   create_security_error_and_log,
@@ -72,15 +75,19 @@ pub struct CryptographicBuiltin {
   //
   // TODO: The current session_id is just a constant. Implementing counting above requires
   // some access to shared mutable state from encryption/send operations.
-  /// For each (local datawriter (/datareader), remote participant) pair, stores
-  /// the matched remote datareader (/datawriter)
-  matched_remote_endpoint:
-    HashMap<EndpointCryptoHandle, HashMap<ParticipantCryptoHandle, EndpointCryptoHandle>>,
+  /// For each local datawriter (/datareader), stores the matched remote
+  /// datareaders (/datawriters)
+  matched_remote_endpoints: HashMap<EndpointCryptoHandle, HashSet<EndpointCryptoHandle>>,
   ///For reverse lookups,  for each remote datawriter (/datareader), stores the
   /// matched local datareader (/datawriter)
   matched_local_endpoint: HashMap<EndpointCryptoHandle, EndpointCryptoHandle>,
 
   crypto_handle_counter: u32,
+
+  // No key may be used twice with the same initialization vector: they are counted.
+  // The random start keeps those of two participants apart, which share the keys
+  // that are derived from their common secret.
+  initialization_vector_counter: AtomicU64,
 }
 
 // Combine the trait implementations from the submodules
@@ -97,9 +104,10 @@ impl CryptographicBuiltin {
       participant_to_endpoint_info: HashMap::new(),
       endpoint_to_participant: HashMap::new(),
       used_local_key_ids: HashSet::from([CryptoTransformKeyId::ZERO]),
-      matched_remote_endpoint: HashMap::new(),
+      matched_remote_endpoints: HashMap::new(),
       matched_local_endpoint: HashMap::new(),
       crypto_handle_counter: 0,
+      initialization_vector_counter: AtomicU64::new(rand::random()),
     }
   }
 
@@ -286,8 +294,11 @@ impl CryptographicBuiltin {
     SessionId::new([1, 3, 3, 7])
   }
 
-  fn random_initialization_vector(&self) -> BuiltinInitializationVector {
-    BuiltinInitializationVector::new(self.session_id(), rand::random())
+  fn next_initialization_vector(&self) -> BuiltinInitializationVector {
+    let count = self
+      .initialization_vector_counter
+      .fetch_add(1, Ordering::Relaxed);
+    BuiltinInitializationVector::new(self.session_id(), count.to_be_bytes())
   }
 
   fn compute_session_key(
@@ -364,7 +375,7 @@ impl CryptographicBuiltin {
 
     let transformation_kind = *transformation_kind;
 
-    let initialization_vector = self.random_initialization_vector();
+    let initialization_vector = self.next_initialization_vector();
 
     let session_key = Self::compute_session_key(
       ReceiverSpecific::No,

@@ -73,98 +73,45 @@ impl ParticipantAccessControl for AccessControlBuiltin {
     domain_id: u16,
     participant_qos: &QosPolicies,
   ) -> SecurityResult<PermissionsHandle> {
-    let permissions_ca_certificate = participant_qos
-      .get_property(QOS_PERMISSIONS_CERTIFICATE_PROPERTY_NAME)
-      .and_then(|certificate_uri| {
-        read_uri(&certificate_uri).map_err(|conf_err| {
-          create_security_error_and_log!(
-            "Failed to read the permissions certificate from {}: {:?}",
-            certificate_uri,
-            conf_err
-          )
-        })
-      })
-      .and_then(|certificate_contents_pem| {
-        Certificate::from_pem(certificate_contents_pem)
-          .map_err(|e| create_security_error_and_log!("{e:?}"))
-      })?;
+    let permissions_ca_certificate =
+      read_certificate(participant_qos, QOS_PERMISSIONS_CERTIFICATE_PROPERTY_NAME)?;
 
-    let domain_rule = participant_qos
-      .get_property(QOS_GOVERNANCE_DOCUMENT_PROPERTY_NAME)
-      .and_then(|governance_uri| {
-        read_uri(&governance_uri).map_err(|conf_err| {
-          create_security_error_and_log!(
-            "Failed to read the domain governance document from {}: {:?}",
-            governance_uri,
-            conf_err
-          )
-        })
-      })
-      .and_then(|governance_bytes| {
-        SignedDocument::from_bytes(&governance_bytes)
-          .map_err(SecurityError::from)
-          .and_then(|signed_document| signed_document.verify_signature(&permissions_ca_certificate))
-      })
-      .and_then(|governance_xml| {
-        DomainGovernanceDocument::from_xml(&String::from_utf8_lossy(governance_xml.as_ref()))
-          .map_err(|e| create_security_error_and_log!("{e:?}"))
-      })
-      .and_then(|domain_governance_document| {
-        domain_governance_document
-          .find_rule(domain_id)
-          .ok_or_else(|| {
-            create_security_error_and_log!("Domain rule not found for the domain_id {}", domain_id)
-          })
-          .cloned()
-      })?;
+    let (_, governance) = read_signed_document(
+      participant_qos,
+      QOS_GOVERNANCE_DOCUMENT_PROPERTY_NAME,
+      &permissions_ca_certificate,
+      DomainGovernanceDocument::from_xml,
+    )?;
+    let domain_rule = governance.find_rule(domain_id).cloned().ok_or_else(|| {
+      let uri = participant_qos
+        .get_property(QOS_GOVERNANCE_DOCUMENT_PROPERTY_NAME)
+        .unwrap_or_default();
+      create_security_error_and_log!("{uri}: no domain rule for domain {domain_id}")
+    })?;
 
-    let signed_permissions = participant_qos
-      .get_property(QOS_PERMISSIONS_DOCUMENT_PROPERTY_NAME)
-      .and_then(|permissions_uri| {
-        read_uri(&permissions_uri).map_err(|conf_err| {
-          create_security_error_and_log!(
-            "Failed to read the domain participant permissions from {}: {:?}",
-            permissions_uri,
-            conf_err
-          )
-        })
-      })?;
-    let domain_participant_permissions = SignedDocument::from_bytes(&signed_permissions)
-      .map_err(SecurityError::from)
-      .and_then(|signed_document| signed_document.verify_signature(&permissions_ca_certificate))
-      .and_then(|permissions_xml| {
-        DomainParticipantPermissions::from_xml(&String::from_utf8_lossy(permissions_xml.as_ref()))
-          .map_err(|e| create_security_error_and_log!("{e:?}"))
-      })?;
+    let (signed_permissions, domain_participant_permissions) = read_signed_document(
+      participant_qos,
+      QOS_PERMISSIONS_DOCUMENT_PROPERTY_NAME,
+      &permissions_ca_certificate,
+      DomainParticipantPermissions::from_xml,
+    )?;
 
     // Check the subject name in the identity certificate matches the one from the
     // permissions document.
     // First get the subject name from the certificate
-    let subject_name: DistinguishedName = participant_qos
-      .get_property(QOS_IDENTITY_CERTIFICATE_PROPERTY_NAME)
-      .and_then(|certificate_uri| {
-        read_uri(&certificate_uri).map_err(|conf_err| {
-          create_security_error_and_log!(
-            "Failed to read the identity certificate from {}: {:?}",
-            certificate_uri,
-            conf_err
-          )
-        })
-      })
-      .and_then(|certificate_contents_pem| {
-        Certificate::from_pem(certificate_contents_pem)
-          .map_err(|e| create_security_error_and_log!("{e:?}"))
-      })
-      .map(|cert| cert.subject_name().clone())?;
+    let subject_name: DistinguishedName =
+      read_certificate(participant_qos, QOS_IDENTITY_CERTIFICATE_PROPERTY_NAME)?
+        .subject_name()
+        .clone();
 
     // Then verify that we have permissions for this subject name
     if domain_participant_permissions
       .find_grant(&subject_name, &Utc::now())
       .is_none()
     {
+      let uri = participant_qos.get_property(QOS_PERMISSIONS_DOCUMENT_PROPERTY_NAME)?;
       Err(create_security_error_and_log!(
-        "The subject name '{}' from the ID certificate not found in the permissions document",
-        subject_name
+        "{uri}: no grant that is valid now for {subject_name}, the subject of the identity certificate"
       ))?;
     }
 

@@ -32,7 +32,7 @@ use super::{
     parse_signature_algo_name_to_ring, BuiltinAuthenticatedPeerCredentialToken,
     BuiltinIdentityToken, DH_MODP_KAGREE_ALGO_NAME, ECDH_KAGREE_ALGO_NAME,
     QOS_IDENTITY_CA_PROPERTY_NAME, QOS_IDENTITY_CERTIFICATE_PROPERTY_NAME,
-    QOS_PASSWORD_PROPERTY_NAME, QOS_PRIVATE_KEY_PROPERTY_NAME,
+    QOS_PRIVATE_KEY_PROPERTY_NAME,
   },
   BuiltinHandshakeState, DHKeys, LocalParticipantInfo, RemoteParticipantInfo,
 };
@@ -40,8 +40,7 @@ use super::{
 // GUID start from certificate subject name, as dictated in DDS Security spec
 // v1.1 Section "9.3.3 DDS:Auth:PKI-DH plugin behavior", Table 52
 fn guid_start_from_certificate(identity_cert: &Certificate) -> SecurityResult<[u8; 6]> {
-  let subject_name_der = identity_cert.subject_name_der()?;
-  let subject_name_der_hash = Sha256::hash(&subject_name_der);
+  let subject_name_der_hash = Sha256::hash(identity_cert.subject_name_der());
 
   // slice and unwrap will succeed, because input size is static
   // Procedure: Take beginning (8 bytes) from subject name DER hash, convert to
@@ -61,8 +60,15 @@ fn guid_start_from_certificate(identity_cert: &Certificate) -> SecurityResult<[u
 
 fn validate_remote_guid(
   remote_guid: GUID,
+  sender: GuidPrefix,
   remote_identity_cert: &Certificate,
 ) -> SecurityResult<()> {
+  if remote_guid.prefix != sender {
+    return Err(create_security_error_and_log!(
+      "Participant {sender:?} shows the data of {:?}",
+      remote_guid.prefix
+    ));
+  }
   let actual_guid_start = &remote_guid.prefix.as_ref()[0..6];
   let expected_guid_start = guid_start_from_certificate(remote_identity_cert).map_err(|e| {
     create_security_error_and_log!("Could not determine the expected GUID start: {e}")
@@ -116,67 +122,29 @@ impl Authentication for AuthenticationBuiltin {
     // * performing verify and sign operations with this participant's private key
     // * accessing the participant GUID (candidate or adjusted??)
 
-    //TODO: These loading code snippets are too cut-and-paste. Copied from access
-    // control.
-    let identity_ca = participant_qos
-      .get_property(QOS_IDENTITY_CA_PROPERTY_NAME)
-      .and_then(|certificate_uri| {
-        read_uri(&certificate_uri).map_err(|conf_err| {
-          create_security_error_and_log!(
-            "Failed to read the identity CA certificate from {}: {:?}",
-            certificate_uri,
-            conf_err
-          )
-        })
-      })
-      .and_then(|certificate_contents_pem| {
-        Certificate::from_pem(certificate_contents_pem)
-          .map_err(|e| create_security_error_and_log!("{e:?}"))
-      })?;
+    let identity_ca = read_certificate(participant_qos, QOS_IDENTITY_CA_PROPERTY_NAME)?;
 
-    let identity_certificate = participant_qos
-      .get_property(QOS_IDENTITY_CERTIFICATE_PROPERTY_NAME)
-      .and_then(|certificate_uri| {
-        read_uri(&certificate_uri).map_err(|conf_err| {
-          create_security_error_and_log!(
-            "Failed to read the DomainParticipant identity certificate from {}: {:?}",
-            certificate_uri,
-            conf_err
-          )
-        })
-      })
-      .and_then(|certificate_contents_pem| {
-        Certificate::from_pem(certificate_contents_pem)
-          .map_err(|e| create_security_error_and_log!("{e:?}"))
-      })?;
+    let identity_certificate =
+      read_certificate(participant_qos, QOS_IDENTITY_CERTIFICATE_PROPERTY_NAME)?;
 
-    // TODO: decrypt a password protected private key
-    let _password = participant_qos.get_optional_property(QOS_PASSWORD_PROPERTY_NAME);
-
-    let id_cert_algorithm = identity_certificate.algorithm().ok_or_else(|| {
-      create_security_error_and_log!("Cannot recognize identity certificate algorithm.")
-    })?;
-
-    let id_cert_private_key = participant_qos
-      .get_property(QOS_PRIVATE_KEY_PROPERTY_NAME)
-      .and_then(|pem_uri| {
-        read_uri_to_private_key(&pem_uri, id_cert_algorithm).map_err(|conf_err| {
-          create_security_error_and_log!(
-            "Failed to read the DomainParticipant identity private key from {}: {:?}",
-            pem_uri,
-            conf_err
-          )
-        })
-      })?;
+    let id_cert_private_key = read_private_key(participant_qos, QOS_PRIVATE_KEY_PROPERTY_NAME)?;
 
     // Verify that CA has signed our identity
     identity_certificate
       .verify_signed_by_certificate(&identity_ca)
-      .map_err(|_e| {
-        create_security_error_and_log!(
-          "My own identity certificate does not verify against identity CA."
-        )
+      .map_err(|e| {
+        let uri = participant_qos
+          .get_property(QOS_IDENTITY_CERTIFICATE_PROPERTY_NAME)
+          .unwrap_or_default();
+        create_security_error_and_log!("{uri}: {}", e.msg)
       })?;
+
+    if id_cert_private_key.public_key() != identity_certificate.public_key() {
+      let uri = participant_qos.get_property(QOS_PRIVATE_KEY_PROPERTY_NAME)?;
+      return Err(create_security_error_and_log!(
+        "{uri}: is not the private key of the identity certificate"
+      ));
+    }
 
     // TODO: Check (somehow) that my identity has not been revoked.
 
@@ -196,24 +164,11 @@ impl Authentication for AuthenticationBuiltin {
     // Section "9.3.2.1 DDS:Auth:PKI-DH IdentityToken"
     // Table 45
     //
-    let certificate_algorithm = identity_certificate
-      .key_algorithm()
-      .ok_or_else(|| {
-        create_security_error_and_log!("Identity Certificate specifies no public key algorithm")
-      })
-      .and_then(CertificateAlgorithm::try_from)?;
-    let ca_algorithm = identity_ca
-      .key_algorithm()
-      .ok_or_else(|| {
-        create_security_error_and_log!("CA Certificate specifies no public key algorithm")
-      })
-      .and_then(CertificateAlgorithm::try_from)?;
-
     let identity_token = BuiltinIdentityToken {
       certificate_subject: Some(identity_certificate.subject_name().clone().serialize()),
-      certificate_algorithm: Some(certificate_algorithm),
+      certificate_algorithm: Some(CertificateAlgorithm::ECPrime256v1),
       ca_subject: Some(identity_ca.subject_name().clone().serialize()),
-      ca_algorithm: Some(ca_algorithm),
+      ca_algorithm: Some(CertificateAlgorithm::ECPrime256v1),
     };
 
     let local_identity_handle = self.get_new_identity_handle();
@@ -241,6 +196,7 @@ impl Authentication for AuthenticationBuiltin {
     let random_bytes3 = self.generate_random_32_bytes()?;
 
     let self_remote_info = RemoteParticipantInfo {
+      guid_prefix: adjusted_guid.prefix,
       identity_certificate_opt: None,
       signed_permissions_xml_opt: None,
       handshake: HandshakeInfo {
@@ -376,7 +332,7 @@ impl Authentication for AuthenticationBuiltin {
     let remote_identity_handle = self.get_new_identity_handle();
 
     let remote_info = RemoteParticipantInfo {
-      //guid_prefix: remote_participant_guidp,
+      guid_prefix: remote_participant_guidp,
       //identity_token: remote_identity_token,
       identity_certificate_opt: None,   // Not yet available
       signed_permissions_xml_opt: None, // Not yet available
@@ -432,7 +388,7 @@ impl Authentication for AuthenticationBuiltin {
 
     let dsign_algo = local_info
       .identity_certificate
-      .signature_algorithm_identifier()?;
+      .signature_algorithm_identifier();
 
     let kagree_algo = Bytes::from(dh_keys.kagree_algo_name_str());
 
@@ -516,6 +472,7 @@ impl Authentication for AuthenticationBuiltin {
 
     // Make sure we are expecting a authentication request from remote
     let remote_info = self.get_remote_participant_info(&initiator_identity_handle)?;
+    let sender = remote_info.guid_prefix;
     if let BuiltinHandshakeState::PendingRequestMessage = remote_info.handshake.state {
       // Nothing to see here. Carry on.
     } else {
@@ -547,14 +504,14 @@ impl Authentication for AuthenticationBuiltin {
         )
       })?;
 
-    validate_remote_guid(remote_pdata.participant_guid, &cert1).map_err(|e| {
+    validate_remote_guid(remote_pdata.participant_guid, sender, &cert1).map_err(|e| {
       create_security_error_and_log!("Remote GUID does not comply with the spec: {e}")
     })?;
 
     // Check which key agreement algorithm the remote has chosen & generate our own
     // key pair
     let dh2_keys = if request.c_kagree_algo == *DH_MODP_KAGREE_ALGO_NAME {
-      DHKeys::new_modp_keys()?
+      DHKeys::new_modp_keys(&self.secure_random_generator)?
     } else if request.c_kagree_algo == *ECDH_KAGREE_ALGO_NAME {
       DHKeys::new_ec_keys(&self.secure_random_generator)?
     } else {
@@ -601,7 +558,7 @@ impl Authentication for AuthenticationBuiltin {
 
     let my_dsign_algo = local_info
       .identity_certificate
-      .signature_algorithm_identifier()?;
+      .signature_algorithm_identifier();
 
     let pdata_bytes = Bytes::from(serialized_local_participant_data);
 
@@ -701,6 +658,7 @@ impl Authentication for AuthenticationBuiltin {
     // key pairs, which cannot be cloned. We just move the "state" out and leave
     // a dummy value behind. At the end of this function we will overwrite the
     // dummy.
+    let sender = remote_info.guid_prefix;
     let mut state = BuiltinHandshakeState::PendingRequestSend; // dummy to leave behind
     std::mem::swap(&mut remote_info.handshake.state, &mut state);
 
@@ -740,7 +698,7 @@ impl Authentication for AuthenticationBuiltin {
             )
           })?;
 
-        validate_remote_guid(remote_pdata.participant_guid, &cert2).map_err(|e| {
+        validate_remote_guid(remote_pdata.participant_guid, sender, &cert2).map_err(|e| {
           create_security_error_and_log!("Remote GUID does not comply with the spec: {e}")
         })?;
 
@@ -796,6 +754,9 @@ impl Authentication for AuthenticationBuiltin {
         // Note: We already verified above that hash_c1-recomputed vs. hash_c1-stored
         // match and hash_c2 recomputed vs received (if any) match.
 
+        // A reply may repeat DH1 (Table 50), but ours is what counts.
+        let dh1_public_key = dh1.public_key_bytes()?;
+
         let cc2_properties: Vec<BinaryProperty> = vec![
           BinaryProperty::with_propagate(
             "hash_c2",
@@ -810,7 +771,7 @@ impl Authentication for AuthenticationBuiltin {
             "challenge1",
             Bytes::copy_from_slice(reply.challenge1.as_ref()),
           ),
-          BinaryProperty::with_propagate("dh1", Bytes::copy_from_slice(reply.dh1.as_ref())),
+          BinaryProperty::with_propagate("dh1", dh1_public_key.clone()),
           BinaryProperty::with_propagate("hash_c1", Bytes::copy_from_slice(hash_c1.as_ref())),
         ];
 
@@ -834,8 +795,6 @@ impl Authentication for AuthenticationBuiltin {
              HandshakeReplyMessageToken. Expected {expected_kagree_algo}"
           ));
         }
-
-        let dh1_public_key = dh1.public_key_bytes()?;
 
         // Compute the shared secret
         let shared_secret = dh1.compute_shared_secret(reply.dh2.clone())?;
@@ -941,7 +900,7 @@ impl Authentication for AuthenticationBuiltin {
         }
 
         // sanity check
-        if dh1_public != final_token.dh1 {
+        if final_token.dh1.is_some_and(|dh1| dh1 != dh1_public) {
           return Err(create_security_error_and_log!(
             "Diffie-Hellman parameter DH1 mismatch on authentication final receive"
           ));
@@ -949,7 +908,7 @@ impl Authentication for AuthenticationBuiltin {
 
         // sanity check
         let dh2_public_key = dh2.public_key_bytes()?;
-        if dh2_public_key.as_ref() != final_token.dh2.as_ref() {
+        if final_token.dh2.is_some_and(|dh2| dh2 != dh2_public_key) {
           return Err(create_security_error_and_log!(
             "Diffie-Hellman parameter DH2 mismatch on authentication final receive"
           ));
@@ -987,7 +946,7 @@ impl Authentication for AuthenticationBuiltin {
 
         // Now we use the remote certificate, which we verified in the previous (request
         // -> reply) step against CA.
-        let remote_signature_algo_name = remote_id_certificate.signature_algorithm_identifier()?;
+        let remote_signature_algo_name = remote_id_certificate.signature_algorithm_identifier();
         let remote_signature_algorithm =
           parse_signature_algo_name_to_ring(&remote_signature_algo_name)?;
 
@@ -1122,7 +1081,7 @@ iHhbVPRB9Uxts9CwglxYgZoUdGUAxreYIIaLO4yLqw==
     let invalid_guid = GUID::dummy_test_guid(EntityKind::PARTICIPANT_BUILT_IN);
     let some_certificate = Certificate::from_pem(cert_pem).unwrap();
 
-    let validation_res = validate_remote_guid(invalid_guid, &some_certificate);
+    let validation_res = validate_remote_guid(invalid_guid, invalid_guid.prefix, &some_certificate);
 
     assert!(
       validation_res.is_err(),

@@ -1,6 +1,5 @@
 use bytes::Bytes;
 use log::debug;
-use x509_certificate::KeyAlgorithm;
 
 use crate::{
   create_security_error_and_log,
@@ -16,7 +15,6 @@ pub(in crate::security) const QOS_IDENTITY_CA_PROPERTY_NAME: &str = "dds.sec.aut
 pub(in crate::security) const QOS_IDENTITY_CERTIFICATE_PROPERTY_NAME: &str =
   "dds.sec.auth.identity_certificate";
 pub(in crate::security) const QOS_PRIVATE_KEY_PROPERTY_NAME: &str = "dds.sec.auth.private_key";
-pub(in crate::security) const QOS_PASSWORD_PROPERTY_NAME: &str = "dds.sec.auth.password";
 
 // Expected property names in IdentityToken
 pub(in crate::security) const CERT_SN_PROPERTY_NAME: &str = "dds.cert.sn";
@@ -27,8 +25,6 @@ const CA_ALGO_PROPERTY_NAME: &str = "dds.ca.algo";
 // Algorithm identifiers used in IdentityToken and PermissionsToken
 const RSA_2048_ALGO_NAME: &str = "RSA-2048";
 const EC_PRIME_ALGO_NAME: &str = "EC-prime256v1";
-
-pub(in crate::security) const RSA_2048_KEY_LENGTH: usize = 256;
 
 #[derive(Debug, Clone, Copy)]
 pub(in crate::security) enum CertificateAlgorithm {
@@ -65,24 +61,6 @@ impl TryFrom<String> for CertificateAlgorithm {
   type Error = SecurityError;
   fn try_from(value: String) -> Result<Self, Self::Error> {
     value.parse()
-  }
-}
-
-// Convert public-key algortihm identifiers from x509_certficate crate to
-// our representation.
-impl TryFrom<x509_certificate::KeyAlgorithm> for CertificateAlgorithm {
-  type Error = SecurityError;
-  fn try_from(value: KeyAlgorithm) -> Result<Self, Self::Error> {
-    match value {
-      KeyAlgorithm::Rsa => Ok(CertificateAlgorithm::RSA2048),
-      KeyAlgorithm::Ecdsa(x509_certificate::algorithm::EcdsaCurve::Secp256r1) => {
-        Ok(CertificateAlgorithm::ECPrime256v1)
-      }
-      x => Err(create_security_error_and_log!(
-        "Unsuppored certificate algorithm: {:?}",
-        x
-      )),
-    }
   }
 }
 
@@ -309,7 +287,7 @@ pub(crate) fn parse_signature_algo_name_to_ring(
   algo_name: &[u8],
 ) -> SecurityResult<&'static dyn ring::signature::VerificationAlgorithm> {
   match algo_name {
-    RSA_SIGNATURE_ALGO_NAME => Ok(&ring::signature::RSA_PSS_2048_8192_SHA256),
+    RSA_SIGNATURE_ALGO_NAME => Err(create_security_error_and_log!("RSA is not supported")),
     ECDSA_SIGNATURE_ALGO_NAME => Ok(&ring::signature::ECDSA_P256_SHA256_ASN1),
     _other =>
     // TODO: Log the algorithm name, but be careful,
@@ -423,9 +401,6 @@ impl BuiltinHandshakeMessageToken {
       .challenge2
       .ok_or_else(|| create_security_error_and_log!("challenge2 not found"))
       .and_then(|b| Challenge::try_from(b.as_ref()))?;
-    let dh1 = self
-      .dh1
-      .ok_or_else(|| create_security_error_and_log!("dh1 not found"))?;
     let dh2 = self
       .dh2
       .ok_or_else(|| create_security_error_and_log!("dh2 not found"))?;
@@ -443,7 +418,6 @@ impl BuiltinHandshakeMessageToken {
       hash_c2,
       challenge1,
       challenge2,
-      dh1,
       dh2,
       signature,
     })
@@ -468,12 +442,9 @@ impl BuiltinHandshakeMessageToken {
       .challenge2
       .ok_or_else(|| create_security_error_and_log!("challenge2 not found"))
       .and_then(|b| Challenge::try_from(b.as_ref()))?;
-    let dh1 = self
-      .dh1
-      .ok_or_else(|| create_security_error_and_log!("dh1 not found"))?;
-    let dh2 = self
-      .dh2
-      .ok_or_else(|| create_security_error_and_log!("dh2 not found"))?;
+    // Both are optional (Table 51): what they hold is a part of what is signed.
+    let dh1 = self.dh1;
+    let dh2 = self.dh2;
     let signature = self
       .signature
       .ok_or_else(|| create_security_error_and_log!("signature not found"))?;
@@ -515,7 +486,6 @@ pub(in crate::security) struct HandshakeReply {
   pub hash_c2: Option<Sha256>,
   pub challenge1: Challenge,
   pub challenge2: Challenge,
-  pub dh1: Bytes,
   pub dh2: Bytes,
   pub signature: Bytes,
 }
@@ -526,8 +496,8 @@ pub(in crate::security) struct HandshakeFinal {
   pub hash_c2: Option<Sha256>,
   pub challenge1: Challenge,
   pub challenge2: Challenge,
-  pub dh1: Bytes,
-  pub dh2: Bytes,
+  pub dh1: Option<Bytes>,
+  pub dh2: Option<Bytes>,
   pub signature: Bytes,
 }
 

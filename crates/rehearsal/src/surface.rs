@@ -2,10 +2,7 @@
 
 use heightmap::Heightmap;
 use nalgebra::Point2;
-use pick_place::{PickPlace, Touchdown};
-use ur_driver::ContactSign;
-
-use crate::parameters::Contact;
+use pick_place::{ContactSettings, ContactSign, PickPlace, Touchdown};
 
 /// The cup rests on what is this near (m).
 const CUP_RADIUS_M: f64 = 0.008;
@@ -18,14 +15,14 @@ const TOP: f64 = 0.9;
 /// Of the cells beside an object this share is lower than its ground.
 const GROUND: f64 = 0.05;
 
-/// How the tip comes down for an action; nothing where the descents are to be fast to their end.
+/// How the tip comes down for an action; `None` where the descents are to be fast to their end.
 ///
 /// # Errors
 /// Names the pose at which nothing was seen.
-pub(crate) fn touchdown(
+pub fn touchdown(
     heightmap: &Heightmap,
     action: &PickPlace,
-    contact: &Contact,
+    contact: &ContactSettings,
     sign: ContactSign,
 ) -> Result<Option<Touchdown>, String> {
     if contact.slow_from_m <= 0.0 {
@@ -58,12 +55,12 @@ pub(crate) fn touchdown(
     }))
 }
 
-/// The height of what the cup meets at a point (m); nothing where none was seen.
+/// The height of what the cup meets at a point (m); `None` where none was seen.
 pub(crate) fn top_m(heightmap: &Heightmap, at: &Point2<f64>) -> Option<f64> {
     quantile_m(heightmap, at, CUP_RADIUS_M, TOP)
 }
 
-/// The height that a share of the cells around a point do not exceed (m); nothing where none was seen.
+/// The height that a share of the cells around a point do not exceed (m); `None` where none was seen.
 fn quantile_m(
     heightmap: &Heightmap,
     center: &Point2<f64>,
@@ -121,10 +118,10 @@ mod tests {
         }
     }
 
-    fn slow() -> Contact {
-        Contact {
+    fn slow() -> ContactSettings {
+        ContactSettings {
             slow_from_m: 0.03,
-            ..Contact::default()
+            ..ContactSettings::default()
         }
     }
 
@@ -163,9 +160,9 @@ mod tests {
 
     #[test]
     fn without_a_slow_part_the_surfaces_do_not_count_and_contact_has_to_be_sensed() {
-        let fast = Contact {
+        let fast = ContactSettings {
             slow_from_m: 0.0,
-            ..Contact::default()
+            ..ContactSettings::default()
         };
         let of = |sign| touchdown(&table(), &action(), &fast, sign);
         assert_eq!(of(ContactSign::UntilAction), Ok(None));

@@ -1,13 +1,16 @@
 //! Whether an operator is present, as the operator's console says.
 
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
-/// The last sign of the operator.
+/// Time between messages that say whether the operator is present.
+pub const PRESENCE_PERIOD: Duration = Duration::from_millis(200);
+
+/// The last sign of the operator. Times are monotonic, from any origin.
 #[derive(Clone, Copy, Debug)]
 pub struct Presence {
     timeout: Duration,
-    /// When it was last said that the operator is present; nothing since it was said that nobody is.
-    present_at: Option<Instant>,
+    /// When the last message with `is_present` came; `None` after one without.
+    present_at: Option<Duration>,
 }
 
 impl Presence {
@@ -20,17 +23,17 @@ impl Presence {
     }
 
     /// The console has said whether the operator is present.
-    pub fn on_message(&mut self, is_present: bool, now: Instant) {
+    pub fn on_message(&mut self, is_present: bool, now: Duration) {
         self.present_at = is_present.then_some(now);
     }
 
-    /// When the operator will not be present any more without another sign; nothing where nobody is.
-    pub fn deadline(&self) -> Option<Instant> {
+    /// When the presence expires without another message; `None` while nobody is present.
+    pub fn deadline(&self) -> Option<Duration> {
         Some(self.present_at? + self.timeout)
     }
 
     /// Whether an operator is present.
-    pub fn is_present(&self, now: Instant) -> bool {
+    pub fn is_present(&self, now: Duration) -> bool {
         self.deadline().is_some_and(|deadline| now < deadline)
     }
 }
@@ -42,7 +45,7 @@ mod tests {
     #[test]
     fn a_sign_counts_for_the_timeout_and_until_somebody_says_otherwise() {
         let timeout = Duration::from_secs(1);
-        let start = Instant::now();
+        let start = Duration::from_secs(7);
         let mut presence = Presence::new(timeout);
         assert!(!presence.is_present(start));
         presence.on_message(true, start);

@@ -301,7 +301,8 @@ impl Radial {
                 let first = |polynomial: &[f64]| {
                     roots(polynomial, WIDEST).first().copied().unwrap_or(WIDEST)
                 };
-                first(&slope).min(first(&below))
+                // Where the denominator ends the factor has no value: just before it, it has.
+                first(&slope).min(first(&below) * (1.0 - 1e-9))
             }
             Self::Equidistant([k1, k2, k3, k4]) => {
                 let slope = [1.0, 3.0 * k1, 5.0 * k2, 7.0 * k3, 9.0 * k4];

@@ -14,7 +14,7 @@ use pick_place::{PickPlace, PrimitiveSettings};
 use crate::mutation::{Mutation, planted};
 use crate::{
     MotionCause, Obstacle, OperatorDecision, Proposal, ProposalId, ProposalStatus, RefusalReason,
-    StepOutcome,
+    StepOutcome, Verdict,
 };
 
 /// Heightmaps kept, by stamp, until the proposals that were made from them arrive.
@@ -50,7 +50,7 @@ impl RequireApproval {
             Self::Unsure { threshold } => {
                 let success = proposal.success_probability;
                 let is_sure = success.is_some_and(|success| success >= *threshold);
-                !is_sure || proposal.verdict() == crate::Verdict::Done
+                !is_sure || proposal.verdict() == Verdict::Done
             }
             Self::Never => false,
         }
@@ -461,7 +461,7 @@ struct Home {
 }
 
 /// The answer to a confirmation.
-enum Verdict {
+enum Answer {
     Act(GateAction),
     Report(StepOutcome, String),
     Refuse(Refusal),
@@ -661,10 +661,10 @@ impl ApprovalGate {
     }
 
     /// The answer about an id without a status.
-    fn unknown(&self, id: ProposalId) -> Verdict {
+    fn unknown(&self, id: ProposalId) -> Answer {
         match self.why_invalid(id) {
-            Some(reason) => Verdict::Refuse(reason.clone().into()),
-            None => Verdict::Wait(Refusal::Unknown { id }),
+            Some(reason) => Answer::Refuse(reason.clone().into()),
+            None => Answer::Wait(Refusal::Unknown { id }),
         }
     }
 
@@ -744,14 +744,14 @@ impl ApprovalGate {
             OperatorDecision::Reject => self.reject(id),
             OperatorDecision::Stop => self.stop(id),
             OperatorDecision::Advance | OperatorDecision::Retry | OperatorDecision::StepBack => {
-                Verdict::Nothing
+                Answer::Nothing
             }
         };
         match verdict {
-            Verdict::Act(action) => actions.push(action),
-            Verdict::Report(outcome, reason) => actions.push(self.report(id, outcome, reason)),
-            Verdict::Refuse(refusal) => actions.push(self.refuse(id, &refusal)),
-            Verdict::Wait(refusal) => {
+            Answer::Act(action) => actions.push(action),
+            Answer::Report(outcome, reason) => actions.push(self.report(id, outcome, reason)),
+            Answer::Refuse(refusal) => actions.push(self.refuse(id, &refusal)),
+            Answer::Wait(refusal) => {
                 let grace = match refusal {
                     Refusal::NotRehearsed { .. } => REHEARSAL_GRACE,
                     _ => self.rules.confirmation_grace,
@@ -768,7 +768,7 @@ impl ApprovalGate {
                     });
                 }
             }
-            Verdict::Nothing => {}
+            Answer::Nothing => {}
         }
         actions
     }
@@ -915,7 +915,7 @@ impl ApprovalGate {
         self.close_home(ProposalStatus::Withdrawn);
     }
 
-    fn approve(&mut self, id: ProposalId, robot: &impl RobotState) -> Verdict {
+    fn approve(&mut self, id: ProposalId, robot: &impl RobotState) -> Answer {
         let id = match &self.newest {
             Some(newest) if planted(Mutation::AnyApprovalMovesNewest) => newest.proposal.id,
             _ => id,
@@ -923,15 +923,15 @@ impl ApprovalGate {
         match self.status(id) {
             None => return self.unknown(id),
             Some(ProposalStatus::Pending) => {}
-            Some(status) => return Verdict::Refuse(Refusal::NotPending { id, status }),
+            Some(status) => return Answer::Refuse(Refusal::NotPending { id, status }),
         }
         if let Some(moving) = self.moving
             && !planted(Mutation::MovesWhileMoving)
         {
-            return Verdict::Refuse(Refusal::Busy { id, moving });
+            return Answer::Refuse(Refusal::Busy { id, moving });
         }
         if self.homing.is_some() {
-            return Verdict::Refuse(Refusal::Homing { id });
+            return Answer::Refuse(Refusal::Homing { id });
         }
         if let Some(home) = self.home
             && (home.id == id || planted(Mutation::AnyApprovalMovesHome))
@@ -947,20 +947,20 @@ impl ApprovalGate {
             }
             _ => {
                 let status = ProposalStatus::Superseded;
-                return Verdict::Refuse(Refusal::NotPending { id, status });
+                return Answer::Refuse(Refusal::NotPending { id, status });
             }
         };
         if let Some(reason) = &newest.invalid {
-            return Verdict::Refuse(reason.clone().into());
+            return Answer::Refuse(reason.clone().into());
         }
         let proposal = &newest.proposal;
         if let Some(obstacle) = robot.obstacle() {
-            return Verdict::Refuse(Refusal::Robot { id, obstacle });
+            return Answer::Refuse(Refusal::Robot { id, obstacle });
         }
         if let Some(moved_until) = self.moved_until
             && proposal.stamp < moved_until
         {
-            return Verdict::Refuse(Refusal::OldObservation {
+            return Answer::Refuse(Refusal::OldObservation {
                 id,
                 stamp: proposal.stamp,
                 moved_until,
@@ -972,11 +972,11 @@ impl ApprovalGate {
         match robot.check_motion(proposal) {
             Ok(()) => {}
             Err(CannotBegin::Refused(obstacle)) => {
-                return Verdict::Refuse(Refusal::Robot { id, obstacle });
+                return Answer::Refuse(Refusal::Robot { id, obstacle });
             }
             Err(CannotBegin::NotRehearsed) if planted(Mutation::MovesUnrehearsed) => {}
             Err(CannotBegin::NotRehearsed) => {
-                return Verdict::Wait(Refusal::NotRehearsed { id });
+                return Answer::Wait(Refusal::NotRehearsed { id });
             }
         }
         let proposal = Box::new(proposal.clone());
@@ -987,87 +987,87 @@ impl ApprovalGate {
         self.moving = Some(id);
         // After a stop or a fault an approval lets things go on.
         self.unasked.go_on(self.rules.require_approval);
-        Verdict::Act(GateAction::Move(proposal))
+        Answer::Act(GateAction::Move(proposal))
     }
 
     /// Approves a way home. It lets nothing else go on after a stop or a fault.
-    fn approve_home(&mut self, home: Home, robot: &impl RobotState) -> Verdict {
+    fn approve_home(&mut self, home: Home, robot: &impl RobotState) -> Answer {
         let id = home.id;
         if let Some(obstacle) = robot.obstacle() {
-            return Verdict::Refuse(Refusal::Robot { id, obstacle });
+            return Answer::Refuse(Refusal::Robot { id, obstacle });
         }
         match robot.check_recovery(home.recovery) {
             Ok(from_rad) if home.is_from(&from_rad) => {}
             Ok(_) | Err(CannotBegin::NotRehearsed) => {
                 self.close_home(ProposalStatus::Withdrawn);
-                return Verdict::Refuse(Refusal::HomeFromElsewhere { id });
+                return Answer::Refuse(Refusal::HomeFromElsewhere { id });
             }
             Err(CannotBegin::Refused(obstacle)) => {
-                return Verdict::Refuse(Refusal::Robot { id, obstacle });
+                return Answer::Refuse(Refusal::Robot { id, obstacle });
             }
         }
         self.home = None;
         self.set_status(id, ProposalStatus::Moving);
         self.homing = Some(id);
-        Verdict::Act(match home.recovery {
+        Answer::Act(match home.recovery {
             Recovery::Home => GateAction::GoHome(id),
             Recovery::PutDown => GateAction::PutDown(id),
         })
     }
 
-    fn reject(&mut self, id: ProposalId) -> Verdict {
+    fn reject(&mut self, id: ProposalId) -> Answer {
         match self.status(id) {
             None => self.unknown(id),
             Some(ProposalStatus::Pending) => {
                 self.home.take_if(|home| home.id == id);
                 self.set_status(id, ProposalStatus::Rejected);
-                Verdict::Report(StepOutcome::Rejected, "rejected by the operator".into())
+                Answer::Report(StepOutcome::Rejected, "rejected by the operator".into())
             }
-            Some(status) => Verdict::Refuse(Refusal::NotPending { id, status }),
+            Some(status) => Answer::Refuse(Refusal::NotPending { id, status }),
         }
     }
 
     /// A stop is honoured whatever proposal it names.
-    fn stop(&mut self, id: ProposalId) -> Verdict {
+    fn stop(&mut self, id: ProposalId) -> Answer {
         let mut withdrawn = self.close_pending(ProposalStatus::Withdrawn);
         if !planted(Mutation::HomeSurvivesStop) {
             withdrawn |= self.close_home(ProposalStatus::Withdrawn);
         }
         if self.moving.is_some() || self.homing.is_some() {
-            return Verdict::Act(GateAction::Cancel);
+            return Answer::Act(GateAction::Cancel);
         }
         match self.status(id) {
-            None => Verdict::Refuse(Refusal::NothingToStop { id }),
-            Some(ProposalStatus::Withdrawn) if withdrawn => Verdict::Report(
+            None => Answer::Refuse(Refusal::NothingToStop { id }),
+            Some(ProposalStatus::Withdrawn) if withdrawn => Answer::Report(
                 StepOutcome::Stopped,
                 "stopped by the operator; nothing was moving".into(),
             ),
             // After its result it concerns only the goal tracker.
-            Some(_) => Verdict::Nothing,
+            Some(_) => Answer::Nothing,
         }
     }
 
     /// Checks that the newest heightmap shows what the proposal's own does.
-    fn check_unchanged(&self, newest: &Newest) -> Result<(), Verdict> {
+    fn check_unchanged(&self, newest: &Newest) -> Result<(), Answer> {
         let Proposal { id, stamp, .. } = newest.proposal;
         let (Some(source), Some((latest_stamp, latest))) = (&newest.source_heightmap, &self.latest)
         else {
-            return Err(Verdict::Wait(Refusal::NoSourceHeightmap { id, stamp }));
+            return Err(Answer::Wait(Refusal::NoSourceHeightmap { id, stamp }));
         };
         let stamp = *latest_stamp;
         // The first heightmap may have come after the proposal.
         check_inside(&newest.proposal, Some(source.workspace))
-            .map_err(|reason| Verdict::Refuse(reason.into()))?;
+            .map_err(|reason| Answer::Refuse(reason.into()))?;
         let PickPlace { pick, place } = newest.proposal.action;
         let around = [pick, place].map(|pose| pose.translation.vector.into());
         match largest_change(source, latest, &self.rules.changes, &around) {
             Ok(None) => Ok(()),
-            Ok(Some(change)) => Err(Verdict::Refuse(Refusal::ObservationChanged {
+            Ok(Some(change)) => Err(Answer::Refuse(Refusal::ObservationChanged {
                 id,
                 stamp,
                 change,
             })),
-            Err(_) => Err(Verdict::Refuse(Refusal::OtherWorkspace { id, stamp })),
+            Err(_) => Err(Answer::Refuse(Refusal::OtherWorkspace { id, stamp })),
         }
     }
 

@@ -9,7 +9,7 @@ use std::{
         atomic::{AtomicBool, Ordering},
     },
     thread,
-    time::{Duration, Instant},
+    time::Duration,
 };
 
 use futures::StreamExt as _;
@@ -33,9 +33,10 @@ use tracing::{debug, warn};
 use msgs::Action;
 
 use crate::{
+    answerable::{Answerable, Hears},
     clock::Clock,
     graph::Graph,
-    service::{CLIENT_DISCOVERY_TIMEOUT, CallError, CallOptions, ask, attempt},
+    service::{CallError, CallOptions, ask, attempt},
     statistics::Statistics,
 };
 
@@ -61,9 +62,7 @@ type RosClient<A> =
 /// Cancel requests, result requests and repeated goal requests are answered in the background.
 pub struct ActionServer<A: Action + 'static> {
     goals: mpsc::Receiver<NewGoal<A>>,
-    graph: Graph,
-    /// A goal whose client may not hear its feedback yet, and since when.
-    waiting: Option<(NewGoal<A>, Instant)>,
+    waiting: Answerable<NewGoal<A>>,
     shared: Arc<Shared<A>>,
     waker: mio1::Waker,
 }
@@ -133,6 +132,7 @@ impl<A: Action + 'static> ActionServer<A> {
             .register(server.result_server(), mio1::Token(2), readable)?;
         let waker = mio1::Waker::new(poll.registry(), mio1::Token(3))?;
         let (sender, goals) = mpsc::channel(WAITING_GOALS);
+        let feedback = format!("rt{}/_action/feedback", statistics.name);
         let shared = Arc::new(Shared {
             server,
             clock,
@@ -151,8 +151,7 @@ impl<A: Action + 'static> ActionServer<A> {
             .spawn(move || span.in_scope(|| receiving.receive(poll, sender)))?;
         Ok(Self {
             goals,
-            graph,
-            waiting: None,
+            waiting: Answerable::new(graph, feedback, Hears::Feedback),
             shared,
             waker,
         })
@@ -163,20 +162,16 @@ impl<A: Action + 'static> ActionServer<A> {
     /// A client's first goal may come before its reader of feedback is discovered, and what is sent to nobody is lost.
     pub async fn recv(&mut self) -> NewGoal<A> {
         loop {
-            if let Some((goal, since)) = &self.waiting {
-                let topic = format!("rt{}/_action/feedback", self.shared.statistics.name);
-                let limit = CLIENT_DISCOVERY_TIMEOUT.saturating_sub(since.elapsed());
-                self.graph
-                    .wait_for_feedback_to(goal.client, &topic, limit)
-                    .await;
-            }
-            if let Some((goal, _)) = self.waiting.take() {
+            if let Some(goal) = self.waiting.pop() {
                 return goal;
             }
-            match self.goals.recv().await {
-                Some(goal) => self.waiting = Some((goal, Instant::now())),
-                // The receiving thread has gone, which only happens on shutdown.
-                None => std::future::pending().await,
+            tokio::select! {
+                goal = self.goals.recv() => match goal {
+                    Some(goal) => self.waiting.push(goal.client, goal),
+                    // The receiving thread has gone, which only happens on shutdown.
+                    None => std::future::pending().await,
+                },
+                () = self.waiting.changed() => {}
             }
         }
     }

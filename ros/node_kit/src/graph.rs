@@ -83,57 +83,19 @@ impl Graph {
         self.wait(limit, || self.has_action(name)).await
     }
 
-    /// Waits until the reader of a client's answers is discovered. rmw names the reader itself in its requests, ros2-client its writer
-    /// of requests.
-    pub(crate) async fn wait_for_answers_to(
-        &self,
-        client: Gid,
-        dds_topic: &str,
-        limit: Duration,
-    ) -> bool {
-        let one = GUID::from(client).entity_id.entity_kind.is_reader();
-        self.wait_for_reader(client, one, dds_topic, limit).await
+    /// Discovered readers of a topic, as DDS names it.
+    pub(crate) fn reader_ids(&self, dds_topic: &str) -> Vec<GUID> {
+        let readers = self.participant.discovered_readers();
+        readers
+            .iter()
+            .filter(|reader| reader.subscription_topic_data.topic_name() == dds_topic)
+            .map(|reader| reader.reader_proxy.remote_reader_guid)
+            .collect()
     }
 
-    /// The same for what goes to all clients of an action.
-    pub(crate) async fn wait_for_feedback_to(
-        &self,
-        client: Gid,
-        dds_topic: &str,
-        limit: Duration,
-    ) -> bool {
-        self.wait_for_reader(client, false, dds_topic, limit).await
-    }
-
-    /// `one`: it is this very reader, not any of its participant.
-    async fn wait_for_reader(
-        &self,
-        client: Gid,
-        one: bool,
-        dds_topic: &str,
-        limit: Duration,
-    ) -> bool {
-        let client = GUID::from(client);
-        if client.prefix == self.participant.guid().prefix {
-            return true;
-        }
-        let heard = || {
-            self.participant.discovered_readers().iter().any(|reader| {
-                let guid = reader.reader_proxy.remote_reader_guid;
-                let same = match one {
-                    true => guid == client,
-                    false => guid.prefix == client.prefix,
-                };
-                same && reader.subscription_topic_data.topic_name() == dds_topic
-            })
-        };
-        if heard() {
-            return true;
-        }
-        let came = self.wait(limit, heard).await;
-        // Matching follows discovery.
-        tokio::time::sleep(POLL_PERIOD).await;
-        came
+    /// Whether an endpoint is one of this participant.
+    pub(crate) fn is_own(&self, endpoint: GUID) -> bool {
+        endpoint.prefix == self.participant.guid().prefix
     }
 
     /// Which endpoints of other nodes cannot talk to these, which DDS passes over in silence.

@@ -4,6 +4,7 @@
 //! is [`Active`], and a small binary that calls [`main`]; [`Context::start`] composes several in one process.
 
 mod action;
+mod answerable;
 mod arguments;
 mod clock;
 mod context;

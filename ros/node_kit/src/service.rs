@@ -1,19 +1,19 @@
 //! Services, with retries on the client's side: the first reply may be lost while the two ends are
 //! still discovering each other, so servers must be idempotent.
 
-use std::{
-    collections::BTreeSet,
-    sync::Arc,
-    time::{Duration, Instant},
-};
+use std::{sync::Arc, time::Duration};
 
-use ros2_client::{Gid, Message, ReadError, RmwRequestId, service::CallServiceError};
+use ros2_client::{Message, ReadError, RmwRequestId, service::CallServiceError};
 use tokio::{sync::Mutex, time::timeout};
 use tracing::debug;
 
 use msgs::Service;
 
-use crate::{graph::Graph, statistics::Statistics};
+use crate::{
+    answerable::{Answerable, Hears},
+    graph::Graph,
+    statistics::Statistics,
+};
 
 /// How often and how long a call is tried.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -190,20 +190,11 @@ impl<S: Service> ServiceClient<S> {
     }
 }
 
-/// How long a request waits for its client to be able to hear the answer.
-pub(crate) const CLIENT_DISCOVERY_TIMEOUT: Duration = Duration::from_millis(500);
-/// Clients that are remembered as able to.
-const MAX_CLIENTS: usize = 1024;
-
 /// Answers a service.
 pub struct ServiceServer<S: Service> {
     server: ros2_client::Server<S::Request, S::Response>,
     statistics: Arc<Statistics>,
-    graph: Graph,
-    /// Clients whose reader of answers is discovered.
-    hearing: BTreeSet<Gid>,
-    /// A request whose client cannot hear the answer yet, and since when.
-    waiting: Option<(RequestId, S::Request, Instant)>,
+    requests: Answerable<(RequestId, S::Request)>,
 }
 
 /// Which request a response answers.
@@ -216,12 +207,11 @@ impl<S: Service> ServiceServer<S> {
         statistics: Arc<Statistics>,
         graph: Graph,
     ) -> Self {
+        let answers = format!("rr{}Reply", statistics.name);
         Self {
             server,
             statistics,
-            graph,
-            hearing: BTreeSet::new(),
-            waiting: None,
+            requests: Answerable::new(graph, answers, Hears::Answers),
         }
     }
 
@@ -229,41 +219,23 @@ impl<S: Service> ServiceServer<S> {
     /// without losing a request.
     pub async fn recv(&mut self) -> (RequestId, S::Request) {
         loop {
-            if let Some((id, _, since)) = &self.waiting {
-                let (client, since) = (id.0.writer_gid, *since);
-                self.wait_until_heard(client, since).await;
+            if let Some(request) = self.requests.pop() {
+                return request;
             }
-            if let Some((id, request, _)) = self.waiting.take() {
-                return (id, request);
-            }
-            match self.server.async_receive_request().await {
+            let received = tokio::select! {
+                received = self.server.async_receive_request() => received,
+                () = self.requests.changed() => continue,
+            };
+            match received {
                 Ok((id, request)) => {
                     self.statistics.count_message();
-                    self.waiting = Some((RequestId(id), request, Instant::now()));
+                    self.requests.push(id.writer_gid, (RequestId(id), request));
                 }
                 Err(error) => {
                     self.statistics.reject(error);
                     tokio::time::sleep(Duration::from_millis(1)).await;
                 }
             }
-        }
-    }
-
-    /// A client's request may come before its reader of answers is discovered, and what is sent to nobody is lost:
-    /// rclpy's first call after `wait_for_service` would have no answer.
-    async fn wait_until_heard(&mut self, client: Gid, since: Instant) {
-        if self.hearing.contains(&client) {
-            return;
-        }
-        let topic = format!("rr{}Reply", self.statistics.name);
-        let limit = CLIENT_DISCOVERY_TIMEOUT.saturating_sub(since.elapsed());
-        if self.graph.wait_for_answers_to(client, &topic, limit).await {
-            if self.hearing.len() == MAX_CLIENTS {
-                self.hearing.clear();
-            }
-            self.hearing.insert(client);
-        } else {
-            debug!("{}: no reader of answers yet", self.statistics.name);
         }
     }
 

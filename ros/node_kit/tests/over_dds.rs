@@ -1,6 +1,10 @@
 //! Topics, services, actions, time, parameters, rosout and diagnostics over real DDS on loopback.
 
-use std::time::Duration;
+use std::{
+    net::{IpAddr, Ipv4Addr},
+    sync::Arc,
+    time::Duration,
+};
 
 use msgs::{
     Action, Service,
@@ -15,9 +19,10 @@ use msgs::{
     ur_msgs::{SetIORequest, SetIOResponse},
 };
 use node_kit::{
-    ActionServer, Active, CallOptions, Context, GoalStatus, LifecycleClient, Network, NoParameters,
-    Node, Parameters, Publisher, Qos, Range, RawQos, RosArguments, State, Transition,
+    ActionServer, Active, AsBytes, CallOptions, Context, GoalStatus, LifecycleClient, Network,
+    NoParameters, Node, Parameters, Publisher, Qos, Range, RawQos, RosArguments, State, Transition,
 };
+use rustdds::{DomainParticipantBuilder, QosPolicyBuilder, TopicKind, policy};
 use serde::{Deserialize, Serialize};
 use tokio::time::timeout;
 
@@ -326,6 +331,63 @@ async fn services_answer_two_clients() {
     }
     drop(serving);
     assert_eq!(SetIO::NAME, "SetIO");
+}
+
+#[tokio::test(flavor = "multi_thread")]
+async fn a_client_that_cannot_hear_answers_delays_no_other_client() {
+    const UNHEARD: usize = 30;
+    let network = Network::unused().unwrap();
+    let (serving, calling) = (Context::new(network), Context::new(network));
+    let server = node(&serving, "server", "");
+    let service = server.service_server::<SetIO>("set_io").unwrap();
+    let statistics = Arc::clone(service.statistics());
+    let _serving = server.spawn(service.serve(|_| SetIOResponse { success: true }));
+    let client = node(&calling, "client", "")
+        .service_client::<SetIO>("set_io")
+        .unwrap();
+    client.wait_for_server(LIMIT).await.unwrap();
+    client
+        .call(&SetIORequest::default(), &CallOptions::default())
+        .await
+        .unwrap();
+    // A writer of requests alone.
+    let qos = QosPolicyBuilder::new()
+        .reliable(rustdds::Duration::from_secs(1))
+        .history(policy::History::KeepAll)
+        .build();
+    let participant = DomainParticipantBuilder::new(network.domain_id)
+        .with_only_networks([IpAddr::V4(Ipv4Addr::LOCALHOST)])
+        .build()
+        .unwrap();
+    let topic = participant
+        .create_topic(
+            "rq/set_ioRequest".into(),
+            "ur_msgs::srv::dds_::SetIO_Request_".into(),
+            &qos,
+            TopicKind::NoKey,
+        )
+        .unwrap();
+    let publisher = participant.create_publisher(&qos).unwrap();
+    let writer = publisher
+        .create_datawriter_no_key::<Vec<u8>, AsBytes>(&topic, Some(qos))
+        .unwrap();
+    let before = statistics.messages();
+    timeout(LIMIT, async {
+        while statistics.messages() == before {
+            writer.write(vec![0; 8], None).unwrap();
+            tokio::time::sleep(Duration::from_millis(20)).await;
+        }
+    })
+    .await
+    .expect("requests arrive");
+    for _ in 0..UNHEARD {
+        writer.write(vec![0; 8], None).unwrap();
+    }
+    let one = CallOptions {
+        attempts: 1,
+        timeout: Duration::from_secs(5),
+    };
+    client.call(&SetIORequest::default(), &one).await.unwrap();
 }
 
 #[tokio::test(flavor = "multi_thread")]

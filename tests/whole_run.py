@@ -102,7 +102,8 @@ def main() -> None:
         start("camera_fusion", *parameters("camera_fusion"))
         start("goal_oracle", *parameters("goal_oracle", demonstration=demonstration))
         start("gctn_policy", *parameters("gctn_policy", checkpoint=checkpoint))
-        start("suction_executor", *parameters("suction_executor", **sign))
+        # Processes here wait for a processor, as those of a robot's computer do not: a pause of the simulation is no driver that is lost.
+        start("suction_executor", *parameters("suction_executor", driver__status_max_age_s=1.0, **sign))
         operator.listeners = 3
         begin = time.monotonic()
         try:

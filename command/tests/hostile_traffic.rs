@@ -335,8 +335,6 @@ async fn hostile_traffic_on_every_topic_and_service_ends_no_node() -> Result<()>
     });
     let _nodes = attacked.await??;
 
-    // Calls are answered in the order of their arrival: once this one is, the driver has done with the garbage. That may have
-    // switched the tool's voltage off.
     let set_io = node.service_client::<SetIO>(&driver("set_io"))?;
     let voltage = SetIORequest {
         fun: SetIORequest::FUN_SET_TOOL_VOLTAGE,
@@ -347,11 +345,8 @@ async fn hostile_traffic_on_every_topic_and_service_ends_no_node() -> Result<()>
         attempts: PATIENCE.as_secs() as u32,
         ..CallOptions::default()
     };
-    let answer = within("tool voltage", set_io.call(&voltage, &options)).await??;
-    ensure!(answer.success, "the driver refuses the tool's voltage");
-
-    // Garbage that can be read was the driver's state, a call of `propose_home` and a proposal in the place of the
-    // one that was there. What is true is said again, and the run goes on from where it was; topics are
+    // Garbage that can be read was the driver's state, the tool's voltage, a call of `propose_home` and a proposal in the place of
+    // the one that was there. What is true is said again, and the run goes on from where it was; topics are
     // not ordered among each other, so that it may have to be said more than once.
     let mut id = first.id;
     let mut outcome = StepResult::REFUSED;
@@ -363,6 +358,8 @@ async fn hostile_traffic_on_every_topic_and_service_ends_no_node() -> Result<()>
             mode: SafetyMode::NORMAL,
         });
         running.publish(Bool { data: true });
+        let answer = within("tool voltage", set_io.call(&voltage, &options)).await??;
+        ensure!(answer.success, "the driver refuses the tool's voltage");
         tokio::time::sleep(Duration::from_secs(1)).await;
         id = id.wrapping_add(1);
         substitute_proposals.publish(PickPlace {

@@ -371,9 +371,9 @@ async fn a_client_that_cannot_hear_answers_delays_no_other_client() {
     let writer = publisher
         .create_datawriter_no_key::<Vec<u8>, AsBytes>(&topic, Some(qos))
         .unwrap();
-    let before = statistics.messages();
+    let before = statistics.snapshot().messages;
     timeout(LIMIT, async {
-        while statistics.messages() == before {
+        while statistics.snapshot().messages == before {
             writer.write(vec![0; 8], None).unwrap();
             tokio::time::sleep(Duration::from_millis(20)).await;
         }

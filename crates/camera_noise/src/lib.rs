@@ -1,5 +1,6 @@
 //! What real RGB-D cameras do to clean images, drawn from a seed.
 
+mod image;
 mod model;
 mod rig;
 

@@ -1,5 +1,6 @@
 //! A perturbation drawn from a seed, for the cameras of a cell.
 
+use crate::image::{self, Patches, StereoCamera};
 use crate::{Depth, Edges, Perturbation};
 use heightmap::{Camera, Intrinsics, Workspace};
 use nalgebra::{Isometry3, Translation3, Unit, UnitQuaternion, Vector3};
@@ -144,21 +145,27 @@ impl Rig {
             stream(self.seed, self.session, FIRST_IMAGE + image)
         };
         let mut rng = of(1 + frame);
-        let edges = steps(&self.model.edges, width, height, depth_m);
-        let Depth { constant_share, .. } = self.model.depth;
+        let edges = image::steps(&self.model.edges, width, height, depth_m);
+        let stereo = StereoCamera::new(&self.model.depth);
         if self.model.depth.disparity_noise_px > 0.0 {
-            let patch_px = self.model.depth.patch_px;
-            let constant = Patches::draw(&mut of(0), width, height, patch_px);
-            let new = Patches::draw(&mut rng, width, height, patch_px);
-            let (old_part, new_part) = (constant_share.sqrt(), (1.0 - constant_share).sqrt());
-            for (index, depth_m) in depth_m.iter_mut().enumerate() {
-                let (u, v) = (index % width, index / width);
-                let error = old_part as f32 * constant.at(u, v) + new_part as f32 * new.at(u, v);
-                *depth_m = measured(&self.model.depth, *depth_m, error);
+            let Depth {
+                patch_px,
+                constant_share,
+                ..
+            } = self.model.depth;
+            let mut constant = Patches::draw(&mut of(0), width, height, patch_px);
+            let mut new = Patches::draw(&mut rng, width, height, patch_px);
+            let old_part = constant_share.sqrt() as f32;
+            let new_part = (1.0 - constant_share).sqrt() as f32;
+            for (v, row) in depth_m.chunks_exact_mut(width).enumerate() {
+                let errors = constant.row(v).zip(new.row(v));
+                for (depth_m, (old, new)) in row.iter_mut().zip(errors) {
+                    *depth_m = stereo.measured(*depth_m, old_part * old + new_part * new);
+                }
             }
         } else {
             for depth_m in depth_m.iter_mut() {
-                *depth_m = measured(&self.model.depth, *depth_m, 0.0);
+                *depth_m = stereo.measured(*depth_m, 0.0);
             }
         }
         let Edges {
@@ -176,7 +183,8 @@ impl Rig {
             }
         }
         self.punch_holes(&mut rng, width, height, depth_m);
-        self.color(camera, &mut rng, rgb);
+        let noise = self.model.color.noise as f32;
+        image::color(self.cameras[camera].gains, noise, &mut rng, rgb);
     }
 
     fn punch_holes(&self, rng: &mut ChaCha8Rng, width: usize, height: usize, depth_m: &mut [f32]) {
@@ -188,22 +196,6 @@ impl Rig {
             let (left, top) = (rng.random_range(0..width), rng.random_range(0..height));
             for v in top..(top + size).min(height) {
                 depth_m[v * width + left..v * width + (left + size).min(width)].fill(0.0);
-            }
-        }
-    }
-
-    fn color(&self, camera: usize, rng: &mut ChaCha8Rng, rgb: &mut [u8]) {
-        let gains = self.cameras[camera].gains;
-        let noise = self.model.color.noise as f32;
-        for pixel in rgb.chunks_exact_mut(3) {
-            for (value, gain) in pixel.iter_mut().zip(gains) {
-                let error: f32 = if noise > 0.0 {
-                    rng.sample::<f32, _>(StandardNormal) * noise
-                } else {
-                    0.0
-                };
-                // Casts clamp.
-                *value = (f32::from(*value) * gain + error + 0.5) as u8;
             }
         }
     }
@@ -228,100 +220,6 @@ fn item(model: &Perturbation, rng: &mut ChaCha8Rng) -> ClutterItem {
         ),
         rgb: [(); 3].map(|()| rng.random_range(20..=255)),
     }
-}
-
-/// What a stereo camera measures of a depth, its disparity wrong by `error` standard deviations; 0 for nothing.
-fn measured(model: &Depth, depth_m: f32, error: f32) -> f32 {
-    if depth_m.is_nan()
-        || depth_m < model.min_m as f32
-        || depth_m > model.max_m as f32
-        || depth_m <= 0.0
-    {
-        return 0.0;
-    }
-    let scale = (model.focal_px * model.baseline_m) as f32;
-    let mut disparity_px = scale / depth_m + model.disparity_noise_px as f32 * error;
-    let step_px = model.disparity_step_px as f32;
-    if step_px > 0.0 {
-        disparity_px = (disparity_px / step_px).round() * step_px;
-    }
-    if disparity_px <= 0.0 {
-        return 0.0;
-    }
-    let seen_m = scale / disparity_px;
-    let unit_m = model.unit_m as f32;
-    if unit_m > 0.0 {
-        (seen_m / unit_m).round() * unit_m
-    } else {
-        seen_m
-    }
-}
-
-/// Noise of standard deviation 1 that is alike in patches: white noise on a coarse grid, interpolated.
-struct Patches {
-    values: Vec<f32>,
-    columns: usize,
-    /// Grid cells per pixel.
-    scale: f32,
-}
-
-impl Patches {
-    fn draw(rng: &mut ChaCha8Rng, width: usize, height: usize, patch_px: f64) -> Self {
-        let scale = (1.0 / patch_px) as f32;
-        let cells = |pixels: usize| (pixels as f32 * scale) as usize + 2;
-        let (columns, rows) = (cells(width), cells(height));
-        // Between four nodes the variance of a bilinear mean is 4/9 on average.
-        let gain = if patch_px > 1.0 { 1.5 } else { 1.0 };
-        let values = (0..columns * rows).map(|_| gain * rng.sample::<f32, _>(StandardNormal));
-        Self {
-            values: values.collect(),
-            columns,
-            scale,
-        }
-    }
-
-    fn at(&self, u: usize, v: usize) -> f32 {
-        let (x, y) = (u as f32 * self.scale, v as f32 * self.scale);
-        let (column, row) = (x as usize, y as usize);
-        let (right, down) = (x - column as f32, y - row as f32);
-        let upper = &self.values[row * self.columns + column..][..2];
-        let lower = &self.values[(row + 1) * self.columns + column..][..2];
-        let mix = |pair: &[f32]| pair[0] + right * (pair[1] - pair[0]);
-        mix(upper) + down * (mix(lower) - mix(upper))
-    }
-}
-
-/// Pixels near a step in the depth, with the least and the greatest depth around them.
-fn steps(model: &Edges, width: usize, height: usize, depth_m: &[f32]) -> Vec<(usize, f32, f32)> {
-    let reach = model.width_px;
-    let step_m = model.step_m as f32;
-    // Along rows, then along columns: the same square window in two passes.
-    let (mut near, mut far) = (depth_m.to_vec(), depth_m.to_vec());
-    let (mut row_near, mut row_far) = (near.clone(), far.clone());
-    let window = |at: usize, size: usize| at.saturating_sub(reach)..(at + reach + 1).min(size);
-    for v in 0..height {
-        let row = &depth_m[v * width..][..width];
-        for u in 0..width {
-            let around = &row[window(u, width)];
-            row_near[v * width + u] = around.iter().copied().fold(f32::INFINITY, f32::min);
-            row_far[v * width + u] = around.iter().copied().fold(0.0, f32::max);
-        }
-    }
-    for v in 0..height {
-        for u in 0..width {
-            let (mut least, mut greatest) = (f32::INFINITY, 0.0f32);
-            for other in window(v, height) {
-                least = least.min(row_near[other * width + u]);
-                greatest = greatest.max(row_far[other * width + u]);
-            }
-            near[v * width + u] = least;
-            far[v * width + u] = greatest;
-        }
-    }
-    (0..width * height)
-        .filter(|&index| near[index] > 0.0 && far[index] - near[index] > step_m)
-        .map(|index| (index, near[index], far[index]))
-        .collect()
 }
 
 #[cfg(test)]
@@ -516,7 +414,7 @@ mod tests {
     }
 
     #[test]
-    fn colours_calibration_light_and_clutter_stay_within_the_model() {
+    fn colors_calibration_light_and_clutter_stay_within_the_model() {
         let mut model = nothing();
         (model.color.gain, model.color.tint, model.color.noise) = (0.2, 0.1, 3.0);
         (model.extrinsics.shift_m, model.extrinsics.turn_rad) = (0.002, 0.003);

@@ -29,7 +29,7 @@ def main(name: str, begin_s: float, rate_hz: float, seconds: float) -> None:
             at_s = begin_s + count / rate_hz
             time.sleep(max(0.0, at_s - time.time()))
             stamp = Time(sec=int(at_s), nanosec=int((at_s % 1) * 1e9))
-            for message in (view.colour, view.depth, view.info):
+            for message in (view.color, view.depth, view.info):
                 message.header.stamp = stamp
             cameras.publish_view(name, view)
         # What was lost is sent again while the publishers live.

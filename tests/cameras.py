@@ -24,7 +24,7 @@ CAMERA_HEIGHT_M = 1.0
 BOX_HEIGHT_M = 0.05
 # Where depth is not registered.
 DEPTH_CAMERA_UP_M = 0.02
-BOX_COLOUR = (200, 30, 30)
+BOX_COLOR = (200, 30, 30)
 # Rows and columns of the image that show the box: the middle, which is the point (0.5, 0) of the world.
 BOX = np.s_[220:260, 300:340]
 
@@ -43,7 +43,7 @@ IMAGES = QoSProfile(depth=5, reliability=ReliabilityPolicy.RELIABLE, durability=
 class View:
     """What one camera says at one time."""
 
-    colour: Image
+    color: Image
     depth: Image
     info: CameraInfo
     # Where the depth image has a frame of its own.
@@ -113,11 +113,11 @@ class Cameras:
 
     def publish_view(self, name: str, view: View) -> None:
         """Publishes a view of one camera as it is."""
-        colour, depth, info, depth_info = self._publishers[name]
+        color, depth, info, depth_info = self._publishers[name]
         info.publish(view.info)
         if view.depth_info is not None:
             depth_info.publish(view.depth_info)
-        colour.publish(view.colour)
+        color.publish(view.color)
         depth.publish(view.depth)
 
     def publish(self, change: Change = lambda _: None, changed: str | None = "left", leave_out: str | None = None) -> Time:
@@ -141,13 +141,13 @@ def optical_frame(name: str) -> str:
 
 def good_view(header: Header) -> View:
     """The table with the box."""
-    colour = np.full((HEIGHT, WIDTH, 3), 120, dtype=np.uint8)
-    colour[BOX] = BOX_COLOUR
+    color = np.full((HEIGHT, WIDTH, 3), 120, dtype=np.uint8)
+    color[BOX] = BOX_COLOR
     depth = np.full((HEIGHT, WIDTH), CAMERA_HEIGHT_M, dtype=np.float32)
     depth[BOX] = CAMERA_HEIGHT_M - BOX_HEIGHT_M
     centre_x, centre_y = (WIDTH - 1) / 2, (HEIGHT - 1) / 2
     return View(
-        colour=image(header, "rgb8", 3 * WIDTH, colour),
+        color=image(header, "rgb8", 3 * WIDTH, color),
         depth=image(header, "32FC1", 4 * WIDTH, depth),
         info=CameraInfo(
             header=header,
@@ -171,9 +171,9 @@ def image(header: Header, encoding: str, step: int, pixels: np.ndarray) -> Image
 
 def unregistered(view: View) -> None:
     """Depth as of a camera beside that of colour, with a frame and a calibration of its own."""
-    name = view.colour.header.frame_id.removesuffix("_color_optical_frame")
+    name = view.color.header.frame_id.removesuffix("_color_optical_frame")
     set_depth(view, depth_pixels(view) + np.float32(DEPTH_CAMERA_UP_M))
-    view.depth.header = Header(stamp=view.colour.header.stamp, frame_id=f"{name}_depth_optical_frame")
+    view.depth.header = Header(stamp=view.color.header.stamp, frame_id=f"{name}_depth_optical_frame")
     view.depth_info = copy.deepcopy(view.info)
     view.depth_info.header = view.depth.header
 

@@ -9,7 +9,7 @@ import time
 import numpy as np
 import pytest
 from cameras import (
-    BOX_COLOUR,
+    BOX_COLOR,
     BOX_HEIGHT_M,
     CAMERA_HEIGHT_M,
     FOCAL_PX,
@@ -64,7 +64,7 @@ def heights(heightmap: Heightmap) -> np.ndarray:
     return np.asarray(heightmap.height_m).reshape(heightmap.rows, heightmap.cols)
 
 
-def test_three_views_of_a_box_give_its_height_and_colour_where_it_stands(cameras, operator_for_module) -> None:
+def test_three_views_of_a_box_give_its_height_and_color_where_it_stands(cameras, operator_for_module) -> None:
     heightmap = fused(operator_for_module, cameras)
     assert (heightmap.rows, heightmap.cols, heightmap.views) == (320, 160, 3)
     assert heightmap.header.frame_id == "world"
@@ -72,7 +72,7 @@ def test_three_views_of_a_box_give_its_height_and_colour_where_it_stands(cameras
     assert np.abs(middle - BOX_HEIGHT_M).max() < TOLERANCE_M
     assert np.abs(heights(heightmap)[20:60, 20:60]).max() < TOLERANCE_M
     rgb = np.asarray(heightmap.rgb).reshape(320, 160, 3)
-    assert np.abs(rgb[160, 80].astype(int) - BOX_COLOUR).max() <= 1
+    assert np.abs(rgb[160, 80].astype(int) - BOX_COLOR).max() <= 1
 
 
 def test_depth_in_millimetres_gives_the_same_heights(cameras, operator_for_module) -> None:
@@ -120,16 +120,16 @@ def test_holes_in_the_depth_are_no_points(cameras, operator_for_module, hole: fl
 
 
 @pytest.mark.parametrize(("encoding", "channels"), [("bgr8", [2, 1, 0]), ("rgba8", [0, 1, 2, 0]), ("bgra8", [2, 1, 0, 0])])
-def test_colours_are_read_in_every_order_with_padded_rows(cameras, operator_for_module, encoding: str, channels) -> None:
+def test_colors_are_read_in_every_order_with_padded_rows(cameras, operator_for_module, encoding: str, channels) -> None:
     def reorder(view: View) -> None:
-        rgb = np.frombuffer(view.colour.data.tobytes(), dtype=np.uint8).reshape(HEIGHT, WIDTH, 3)
+        rgb = np.frombuffer(view.color.data.tobytes(), dtype=np.uint8).reshape(HEIGHT, WIDTH, 3)
         rows = rgb[:, :, channels].reshape(HEIGHT, -1)
         padded = np.pad(rows, ((0, 0), (0, 13)), constant_values=77)
-        view.colour = image(view.colour.header, encoding, padded.shape[1], padded)
+        view.color = image(view.color.header, encoding, padded.shape[1], padded)
 
     heightmap = fused(operator_for_module, cameras, reorder, None)
     rgb = np.asarray(heightmap.rgb).reshape(320, 160, 3)
-    assert np.abs(rgb[160, 80].astype(int) - BOX_COLOUR).max() <= 1
+    assert np.abs(rgb[160, 80].astype(int) - BOX_COLOR).max() <= 1
 
 
 def test_depth_of_the_other_byte_order_with_padded_rows_gives_the_same_heights(cameras, operator_for_module) -> None:
@@ -158,9 +158,9 @@ def test_a_camera_behind_a_lens_sees_the_box_where_the_others_do(cameras, operat
     def show(view: View, lens: bool) -> None:
         box = inside(ideal_x, ideal_y) if lens else inside(seen_x, seen_y)
         depth = np.where(box, CAMERA_HEIGHT_M - BOX_HEIGHT_M, CAMERA_HEIGHT_M).astype(np.float32)
-        colour = np.where(box[:, :, None], BOX_COLOUR, 120).astype(np.uint8)
+        color = np.where(box[:, :, None], BOX_COLOR, 120).astype(np.uint8)
         set_depth(view, depth)
-        view.colour = image(view.colour.header, "rgb8", 3 * WIDTH, colour)
+        view.color = image(view.color.header, "rgb8", 3 * WIDTH, color)
         if lens:
             view.info.distortion_model = model
             view.info.d = list(LENSES[model])
@@ -179,7 +179,7 @@ def wrong_size(view: View) -> None:
 
 
 def wrong_encoding(view: View) -> None:
-    view.colour.encoding = "yuv422"
+    view.color.encoding = "yuv422"
 
 
 def wrong_depth_encoding(view: View) -> None:
@@ -187,13 +187,13 @@ def wrong_depth_encoding(view: View) -> None:
 
 
 def truncated(view: View) -> None:
-    view.colour.data = view.colour.data[: len(view.colour.data) // 2]
+    view.color.data = view.color.data[: len(view.color.data) // 2]
 
 
-def colour_of_other_size(view: View) -> None:
+def color_of_other_size(view: View) -> None:
     small = np.zeros((HEIGHT // 2, WIDTH // 2, 3), dtype=np.uint8)
-    view.colour = image(view.colour.header, "rgb8", 3 * WIDTH // 2, small)
-    view.colour.height, view.colour.width = HEIGHT // 2, WIDTH // 2
+    view.color = image(view.color.header, "rgb8", 3 * WIDTH // 2, small)
+    view.color.height, view.color.width = HEIGHT // 2, WIDTH // 2
 
 
 def no_focal_length(view: View) -> None:
@@ -225,7 +225,7 @@ def lens_that_folds_the_image(view: View) -> None:
 
 
 def unknown_frame(view: View) -> None:
-    for message in (view.colour, view.depth, view.info):
+    for message in (view.color, view.depth, view.info):
         message.header.frame_id = "nowhere"
 
 
@@ -236,7 +236,7 @@ def unknown_frame(view: View) -> None:
         (wrong_encoding, ["left/color", "yuv422"]),
         (wrong_depth_encoding, ["left/depth", "rgb8"]),
         (truncated, ["left/color"]),
-        (colour_of_other_size, ["left/color"]),
+        (color_of_other_size, ["left/color"]),
         (no_focal_length, ["left/color/camera_info"]),
         (intrinsics_that_are_no_number, ["left/color/camera_info"]),
         (unknown_lens, ["left/color/camera_info", "omnidirectional", "plumb_bob"]),

@@ -55,18 +55,18 @@ fn chart(problem: &str, cells: &[&Cell]) -> Result<Vec<u8>> {
             .label_style(("sans-serif", 15))
             .draw()?;
         for (index, cell) in cells.iter().enumerate() {
-            let colour = Palette99::pick(index).to_rgba();
+            let color = Palette99::pick(index).to_rgba();
             let points = cell.curve.iter().map(|(step, rate)| (*step, 100.0 * rate));
             let points: Vec<_> = std::iter::once((0, 0.0)).chain(points).collect();
             let label = format!("{}, {} demonstrations", cell.agent, cell.demonstrations);
             chart
-                .draw_series(LineSeries::new(points.clone(), colour.stroke_width(2)))?
+                .draw_series(LineSeries::new(points.clone(), color.stroke_width(2)))?
                 .label(label)
                 .legend(move |(x, y)| {
-                    PathElement::new([(x, y), (x + 22, y)], colour.stroke_width(2))
+                    PathElement::new([(x, y), (x + 22, y)], color.stroke_width(2))
                 });
             let dots = points.into_iter().skip(1);
-            chart.draw_series(dots.map(|point| Circle::new(point, 3, colour.filled())))?;
+            chart.draw_series(dots.map(|point| Circle::new(point, 3, color.filled())))?;
         }
         chart
             .configure_series_labels()

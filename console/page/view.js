@@ -46,7 +46,7 @@ const RAMP_PIXELS = Uint32Array.from({ length: 256 }, (_, index) => {
   const [low, high] = [RAMP[Math.floor(at)], RAMP[Math.floor(at) + 1]];
   return pixelOf(...low.map((value, part) => Math.round(value + (high[part] - value) * (at % 1))));
 });
-const [TO_COME, TO_GO, RECOLOURED] = [pixelOf(255, 160, 40), pixelOf(90, 160, 255), pixelOf(224, 110, 224)];
+const [TO_COME, TO_GO, RECOLORED] = [pixelOf(255, 160, 40), pixelOf(90, 160, 255), pixelOf(224, 110, 224)];
 
 /** Draws a heightmap; `other` is what it is compared with. Returns the share of cells that differ, in mode difference. */
 export function draw(canvas, picture, mode, other) {
@@ -69,7 +69,7 @@ export function draw(canvas, picture, mode, other) {
       } else if (comparable) {
         const rise = other.height_m[cell] - height_m[cell];
         const change = Math.max(Math.abs(other.rgb[3 * cell] - r), Math.abs(other.rgb[3 * cell + 1] - g), Math.abs(other.rgb[3 * cell + 2] - b));
-        pixel = rise > HEIGHT_DIFFERS_M ? TO_COME : rise < -HEIGHT_DIFFERS_M ? TO_GO : change > COLOR_DIFFERS ? RECOLOURED : 0;
+        pixel = rise > HEIGHT_DIFFERS_M ? TO_COME : rise < -HEIGHT_DIFFERS_M ? TO_GO : change > COLOR_DIFFERS ? RECOLORED : 0;
         if (pixel) different++;
         else pixel = pixelOf((r + g + b) / 12, (r + g + b) / 12, (r + g + b) / 12);
       } else {

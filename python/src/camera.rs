@@ -119,7 +119,7 @@ impl PyCamera {
 /// Fuses RGB-D images into a heightmap: the highest point of each cell, its colour the mean over the views that saw it.
 ///
 /// `colors` are uint8, (height, width, 3); `depths` float32 (m) along the optical axis, (height, width), 0 or not finite where
-/// nothing was measured. Returns color, uint8, (rows, cols, 3), and height (m), float32, (rows, cols).
+/// nothing was measured. Returns colour, uint8, (rows, cols, 3), and height (m), float32, (rows, cols).
 #[pyfunction]
 #[pyo3(signature = (cameras, colors, depths, workspace=None))]
 #[allow(clippy::needless_pass_by_value, reason = "pyo3 gives arguments away")]

@@ -24,7 +24,7 @@ const CAMERAS: [&str; 3] = ["front", "left", "right"];
 const RATE_HZ: f64 = 30.0;
 /// Width, height; bytes of a pixel of colour and of depth.
 const SIZE: (u32, u32) = (640, 480);
-const COLOUR: (&str, u32) = ("rgb8", 3);
+const COLOR: (&str, u32) = ("rgb8", 3);
 const DEPTH: (&str, u32) = ("16UC1", 2);
 /// How long the two ends may take to find each other.
 const DISCOVERY: Duration = Duration::from_secs(20);
@@ -179,7 +179,7 @@ fn publish(time: Duration) -> Result<ExitCode> {
         };
         let mut topics = Vec::new();
         for camera in CAMERAS {
-            for (name, (encoding, bytes)) in [("color", COLOUR), ("depth", DEPTH)] {
+            for (name, (encoding, bytes)) in [("color", COLOR), ("depth", DEPTH)] {
                 let topic = format!("/{camera}/{name}/image_raw");
                 let image = Image {
                     width: SIZE.0,

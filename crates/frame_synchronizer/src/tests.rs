@@ -415,7 +415,7 @@ fn half_depth(frame: &str) -> Picture {
 }
 
 #[test]
-fn depth_of_another_size_in_the_colour_frame_is_scaled() {
+fn depth_of_another_size_in_the_color_frame_is_scaled() {
     let (fused, complaints) = fuse_with_depth(&mut ready(), half_depth("left"));
     assert_eq!(complaints, []);
     let whole = fuse_with_depth(&mut ready(), depth("left", &CAMERA, 0.95));

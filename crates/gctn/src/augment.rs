@@ -19,7 +19,7 @@ pub(crate) struct Warp {
     /// Whether the image is mirrored, columns in reverse, before it is moved.
     pub mirrored: bool,
     /// Applied to RGB in 0..255; `None` for no change.
-    pub colour: Option<Matrix3<f32>>,
+    pub color: Option<Matrix3<f32>>,
     /// Sensor noise of each image, in the order in which a network reads them; empty without noise.
     pub sensors: Vec<Sensor>,
     /// How the images are sampled.
@@ -32,7 +32,7 @@ impl Warp {
         Self {
             motion_px: Isometry2::identity(),
             mirrored: false,
-            colour: None,
+            color: None,
             sensors: Vec::new(),
             interpolation: Interpolation::Nearest,
         }
@@ -75,11 +75,11 @@ impl Warp {
             })
             .find(|motion| labels_px.iter().all(|label| inside(motion * label)))
             .unwrap_or_else(Isometry2::identity);
-        let mut colour = colour(augmentation, rng);
+        let mut color = color(augmentation, rng);
         if chance(augmentation.permutation_probability, rng) {
             let order = PERMUTATIONS[rng.random_range(0..PERMUTATIONS.len())];
             let permutation = Matrix3::from_fn(|row, col| f32::from(u8::from(order[row] == col)));
-            colour = Some(permutation * colour.unwrap_or_else(Matrix3::identity));
+            color = Some(permutation * color.unwrap_or_else(Matrix3::identity));
         }
         let sensor = &augmentation.sensor;
         let sensors = match *sensor == SensorNoise::NONE {
@@ -89,7 +89,7 @@ impl Warp {
         Self {
             motion_px,
             mirrored,
-            colour,
+            color,
             sensors,
             interpolation: augmentation.interpolation,
         }
@@ -166,7 +166,7 @@ impl Sensor {
 }
 
 /// A turn about the grey axis, so that a grey table stays grey, and a gain on each channel.
-fn colour(augmentation: &Augmentation, rng: &mut impl Rng) -> Option<Matrix3<f32>> {
+fn color(augmentation: &Augmentation, rng: &mut impl Rng) -> Option<Matrix3<f32>> {
     // Draws in any case, so that a lever does not change what the others draw.
     let turned = rng.random::<f64>() < augmentation.hue_probability;
     let angle = rng.random_range(0.0..std::f64::consts::TAU);
@@ -233,7 +233,7 @@ mod tests {
     }
 
     #[test]
-    fn a_permutation_keeps_the_set_of_colours() {
+    fn a_permutation_keeps_the_set_of_colors() {
         let augmentation = Augmentation {
             permutation_probability: 1.0,
             ..Augmentation::NONE
@@ -243,7 +243,7 @@ mod tests {
         for _ in 0..100 {
             let middle = [Point2::new(80.0, 160.0); 2];
             let warp = Warp::draw(&augmentation, 320, 160, 3, middle, &mut rng);
-            let color = warp.colour.unwrap() * Vector3::new(1.0, 2.0, 3.0);
+            let color = warp.color.unwrap() * Vector3::new(1.0, 2.0, 3.0);
             assert_eq!(color.sum(), 6.0);
             seen.insert(color.iter().map(|c| *c as u8).collect::<Vec<_>>());
         }
@@ -294,7 +294,7 @@ mod tests {
             ..Augmentation::NONE
         };
         let mut rng = ChaCha8Rng::seed_from_u64(2);
-        let turn = colour(&augmentation, &mut rng).unwrap();
+        let turn = color(&augmentation, &mut rng).unwrap();
         let grey = Vector3::repeat(100.0);
         assert!((turn * grey - grey).norm() < 1e-3);
         let red = Vector3::new(200.0, 0.0, 0.0);

@@ -60,8 +60,8 @@ impl Reading {
         };
         let difference = |a: Cell, b: Cell| -> Cell { std::array::from_fn(|i| a[i] - b[i]) };
         let sizes = |difference: Cell| {
-            let colour = difference[0].abs() + difference[1].abs() + difference[2].abs();
-            [colour * (1.0 / 3.0), difference[3].abs()]
+            let color = difference[0].abs() + difference[1].abs() + difference[2].abs();
+            [color * (1.0 / 3.0), difference[3].abs()]
         };
         let observation = scaled(observation);
         let (first, rest) = out.split_at_mut(4);
@@ -223,7 +223,7 @@ fn encode_as<const GOALS: usize>(
     let inverse = warp.motion_px.inverse();
     let (cos, sin) = (inverse.rotation.re, inverse.rotation.im);
     let offset = inverse.translation.vector;
-    let colour = |cell: Cell| match &warp.colour {
+    let color = |cell: Cell| match &warp.color {
         None => cell,
         Some(matrix) => {
             let rgb = matrix * Vector3::new(cell[0], cell[1], cell[2]);
@@ -252,7 +252,7 @@ fn encode_as<const GOALS: usize>(
             x_source
         };
         let at = |number: usize, image: &Image<'_>| {
-            let cell = colour(image.sample(x_source, y_source, interpolation));
+            let cell = color(image.sample(x_source, y_source, interpolation));
             match warp.sensors.get(number) {
                 None => cell,
                 Some(sensor) => sensor.read(index, cell),

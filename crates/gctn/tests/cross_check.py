@@ -111,8 +111,8 @@ def compact_input(observation, goal):
     """The 14 channels that the compact network reads."""
     seen, wanted = (np.concatenate([h["rgb"].transpose(2, 0, 1) / 128 - 1.1, h["height_m"][None] / 0.04]) for h in (observation, goal))
     change = wanted - seen
-    colour, height = np.abs(change[:3]).mean(0, keepdims=True), np.abs(change[3:])
-    return np.concatenate([seen, wanted, change, colour, height])
+    color, height = np.abs(change[:3]).mean(0, keepdims=True), np.abs(change[3:])
+    return np.concatenate([seen, wanted, change, color, height])
 
 
 def sequence_input(observation, previous, image):

@@ -487,7 +487,7 @@ mod tests {
     }
 
     #[test]
-    fn the_mean_colour_and_the_greatest_height_of_the_views_win() {
+    fn the_mean_color_and_the_greatest_height_of_the_views_win() {
         let camera = above(0.5, 0.0);
         let (red, low) = images(1.0, [200, 0, 0]);
         let (blue, high) = images(0.9, [0, 0, 101]);

@@ -244,7 +244,7 @@ mod tests {
     }
 
     #[test]
-    fn registered_depth_is_what_the_colour_camera_would_have_measured() {
+    fn registered_depth_is_what_the_color_camera_would_have_measured() {
         // The imagers of a stereo depth camera are some centimetres beside the colour camera, and turned by a little.
         let color = camera(SMALL, Isometry3::identity());
         let beside = Isometry3::new(

@@ -393,7 +393,7 @@ mod tests {
     }
 
     #[test]
-    fn the_median_over_frames_forgets_outliers_and_the_mean_of_colours_is_taken() {
+    fn the_median_over_frames_forgets_outliers_and_the_mean_of_colors_is_taken() {
         let mut fusion = fusion(3);
         let mut out = Heightmap::new(Workspace::RAVENS);
         for (depth_m, rgb) in [(0.95, 90), (0.75, 100), (0.951, 110)] {

@@ -188,7 +188,7 @@ impl Heightmap {
         if self.workspace != other.workspace || sizes(self) != sizes(other) {
             return f64::INFINITY;
         }
-        let colour: u64 = self
+        let color: u64 = self
             .rgb
             .iter()
             .zip(&other.rgb)
@@ -197,7 +197,7 @@ impl Heightmap {
         // A height that is no number is as far away as can be: `min` takes the other one.
         let height = |(a, b): (&f32, &f32)| f64::from(((a - b).abs() / HEIGHT_M).min(1.0));
         let height: f64 = self.height_m.iter().zip(&other.height_m).map(height).sum();
-        (colour as f64 / (3.0 * 255.0) + height) / self.workspace.len() as f64
+        (color as f64 / (3.0 * 255.0) + height) / self.workspace.len() as f64
     }
 
     /// Index of the image that looks most like this one, the first of equals; none of no images.
@@ -277,7 +277,7 @@ mod tests {
     }
 
     #[test]
-    fn the_distance_counts_colours_and_heights_and_the_nearest_is_the_first_of_equals() {
+    fn the_distance_counts_colors_and_heights_and_the_nearest_is_the_first_of_equals() {
         let before = Heightmap::new(Workspace::RAVENS);
         let mut raised = before.clone();
         raised.height_m[..512].fill(0.02);

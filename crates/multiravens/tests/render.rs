@@ -232,7 +232,7 @@ fn neighbouring_faces_leave_no_gap() {
 }
 
 #[test]
-fn a_face_that_looks_up_has_the_colour_of_its_instance() {
+fn a_face_that_looks_up_has_the_color_of_its_instance() {
     let mut scene = Scene::new(WHITE);
     let block = scene.add_mesh(Mesh::cuboid(Vector3::new(0.2, 0.2, 0.1)));
     // A little askew, as a settled body is.

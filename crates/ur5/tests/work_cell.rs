@@ -392,7 +392,7 @@ fn an_arm_of_seven_joints_is_refused_with_their_names() {
 }
 
 #[test]
-fn meshes_are_left_out_with_one_warning_and_a_missing_colour_is_grey() {
+fn meshes_are_left_out_with_one_warning_and_a_missing_color_is_grey() {
     let text = std::fs::read_to_string(URDF).unwrap();
     let plain = cell();
     assert_eq!((plain.skipped.len(), plain.warning()), (0, None));

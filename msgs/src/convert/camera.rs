@@ -320,7 +320,7 @@ mod tests {
     }
 
     #[test]
-    fn grey_images_have_their_grey_in_every_colour() {
+    fn grey_images_have_their_grey_in_every_color() {
         let mut rgb = Vec::new();
         color_from_msg(
             &padded("mono8", 0, 3, &[1, 2, 0, 3, 4, 0]),
@@ -332,7 +332,7 @@ mod tests {
     }
 
     #[test]
-    fn four_colour_encodings_give_the_same_pixels() {
+    fn four_color_encodings_give_the_same_pixels() {
         let expected = [1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12];
         let images = [
             padded("rgb8", 0, 6, &expected),

@@ -204,7 +204,7 @@ mod tests {
     }
 
     #[test]
-    fn a_point_cloud_has_a_coloured_point_over_the_centre_of_each_cell() {
+    fn a_point_cloud_has_a_colored_point_over_the_centre_of_each_cell() {
         let workspace = Workspace {
             rows: 3,
             cols: 2,

@@ -106,14 +106,14 @@ pub(super) struct Resnet43Nets {
 }
 
 /// Mean and standard deviation of colour (as a fraction) and height (m) in Ravens.
-const COLOUR: (f64, f64) = (0.18877631, 0.07276466);
+const COLOR: (f64, f64) = (0.18877631, 0.07276466);
 const HEIGHT_M: (f64, f64) = (0.00509261, 0.00903967);
 
 /// From colour and height to RGB and three times the height, normalised.
 fn normalise(x: &Tensor) -> Tensor {
-    let colour = (x.narrow(1, 0, 3) / 255.0 - COLOUR.0) / COLOUR.1;
+    let color = (x.narrow(1, 0, 3) / 255.0 - COLOR.0) / COLOR.1;
     let height = (x.narrow(1, 3, 1) - HEIGHT_M.0) / HEIGHT_M.1;
-    Tensor::cat(&[&colour, &height, &height, &height], 1)
+    Tensor::cat(&[&color, &height, &height, &height], 1)
 }
 
 impl Resnet43Nets {

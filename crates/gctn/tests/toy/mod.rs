@@ -10,7 +10,7 @@ use rand_chacha::{ChaCha8Rng, rand_core::SeedableRng};
 use std::f64::consts::TAU;
 
 const EDGE_M: f64 = 0.04;
-const COLOURS: [[u8; 3]; 6] = [
+const COLORS: [[u8; 3]; 6] = [
     [255, 87, 89],
     [78, 121, 167],
     [89, 169, 79],
@@ -50,9 +50,9 @@ impl Toy {
         let turn = TAU * f64::from(rng.random_range(0..rotations)) / f64::from(rotations);
         let block = poses[0];
         let wanted = Isometry2::new(poses[4].translation.vector, block.rotation.angle() + turn);
-        let first = rng.random_range(0..COLOURS.len());
-        let colour = |index: usize| COLOURS[(first + index) % COLOURS.len()];
-        let mut before: Vec<_> = (0..4).map(|index| (poses[index], colour(index))).collect();
+        let first = rng.random_range(0..COLORS.len());
+        let color = |index: usize| COLORS[(first + index) % COLORS.len()];
+        let mut before: Vec<_> = (0..4).map(|index| (poses[index], color(index))).collect();
         let observation = render(&before, rng);
         before[0].0 = wanted;
         let goal = render(&before, rng);

@@ -405,7 +405,7 @@ mod tests {
     }
 
     #[test]
-    fn a_pyramid_of_the_right_colours_earns_everything() {
+    fn a_pyramid_of_the_right_colors_earns_everything() {
         let (mut world, mut task) = scene(3);
         assert_eq!(task.reached(&world), 0);
         for goal in 0..6 {
@@ -420,7 +420,7 @@ mod tests {
     }
 
     #[test]
-    fn a_block_of_the_wrong_colour_earns_nothing() {
+    fn a_block_of_the_wrong_color_earns_nothing() {
         let (mut world, mut task) = scene(3);
         for (block, goal) in [(1, 0), (2, 1), (0, 2)] {
             put(&mut world, &task, block, goal, EXACT);
@@ -507,7 +507,7 @@ mod tests {
     }
 
     #[test]
-    fn another_start_wants_the_same_colours_which_lie_in_other_slots() {
+    fn another_start_wants_the_same_colors_which_lie_in_other_slots() {
         let drawn = |start| {
             let (world, task) = scene(EpisodeSeed { scene: 3, start });
             let rgb: Vec<_> = task.goals.iter().map(|g| world.rgb(g.block)).collect();
@@ -527,7 +527,7 @@ mod tests {
     }
 
     #[test]
-    fn every_stand_yaw_and_many_colour_orders_occur() {
+    fn every_stand_yaw_and_many_color_orders_occur() {
         let drawn = (0..100).map(|seed| {
             let (world, task) = scene(seed);
             let yaw = task.stand.rotation.angle() - anchor().rotation.angle();

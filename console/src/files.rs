@@ -7,10 +7,19 @@ use tracing::{info, warn};
 
 use crate::history::RunEvent;
 use crate::server::Page;
+use crate::state::{Answer, PolicyState};
 
 impl Page {
+    /// Shows the demonstration that the goal oracle begins with, where its path is not empty, and takes up the run that was under way.
+    pub fn begin(&self, demonstration: &Path) {
+        if demonstration != Path::new("") {
+            self.show_demonstration(demonstration);
+        }
+        self.resume_run();
+    }
+
     /// Takes up the run that was under way when the console ended.
-    pub fn resume_run(&self) {
+    fn resume_run(&self) {
         if let Some(run) = self.libraries.history.open_run() {
             self.console.change(|state, _| state.resume_run(run));
         }
@@ -32,6 +41,15 @@ impl Page {
                 None
             }
         }
+    }
+
+    /// The policy has answered whether it uses the checkpoint at `path` from now on: what is trained begins with it.
+    pub fn on_checkpoint_answer(&self, path: &Path, answer: Answer<PolicyState>) {
+        if let Ok(policy) = &answer {
+            self.trainings.begin_with(&policy.checkpoint);
+        }
+        self.console
+            .change(|state, now| state.on_checkpoint_answer(path, answer, now));
     }
 
     /// Writes down how a run goes.

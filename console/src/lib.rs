@@ -41,10 +41,15 @@ pub use checkpoints::{Checkpoint, Checkpoints};
 pub use history::{History, RunCount, RunEvent};
 pub use library::{Entry, Libraries, Library};
 pub use listener::{Listener, Stream, TlsError, tls_acceptor};
-pub use preview::{InvalidPlan, Motion, Plan, Point, ScoreMaps};
+pub use preview::{InvalidPlan, InvalidScores, Motion, Plan, Point, ScoreMaps};
 pub use refusal::Refusal;
-pub use run::{Decision, InvalidMessage, NodeReport, Pose, Run, View, Watch};
-pub use server::{Access, InvalidToken, Page, router};
+pub use run::{
+    Decision, InvalidJoints, InvalidMessage, Joints, NodeReport, Pose, Run, View, Watch,
+};
+pub use server::{
+    Access, AddressFileError, InvalidServer, InvalidToken, ListenError, Listening, Page,
+    PageSettings, Server, ServerSettings, TlsFiles, router,
+};
 pub use session::{Sessions, ViewerId};
 pub use state::{Answer, Command, Console, PolicyState, State};
 pub use tokio_rustls::TlsAcceptor;

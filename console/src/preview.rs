@@ -8,7 +8,7 @@ use step_protocol::ProposalId;
 /// Most points of a motion that are shown: 200 s at 50 a second.
 const MOST_POINTS: usize = 10_000;
 /// Most joints of a robot.
-const MOST_JOINTS: usize = 64;
+pub(crate) const MOST_JOINTS: usize = 64;
 /// Time between the points that the page gets.
 const PERIOD_S: f64 = 0.06;
 
@@ -171,6 +171,56 @@ pub struct ScoreMaps {
     pub rgb: Vec<u8>,
 }
 
+/// A picture that does not hold two score maps.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[error(
+    "{height} x {width} pixels as {encoding:?} in {bytes} bytes with step {step}, expected two maps side by side as rgb8 without padding"
+)]
+pub struct InvalidScores {
+    height: u32,
+    width: u32,
+    encoding: String,
+    bytes: usize,
+    step: u32,
+}
+
+impl ScoreMaps {
+    /// The maps in a picture of two maps side by side, of an `encoding` of ROS and with `step` bytes for each row.
+    ///
+    /// # Errors
+    /// When it is not rgb8, not of two maps of the same width, or its rows are padded.
+    pub fn side_by_side(
+        stamp: Duration,
+        [height, width]: [u32; 2],
+        encoding: &str,
+        step: u32,
+        rgb: Vec<u8>,
+    ) -> Result<Self, InvalidScores> {
+        let row = 3 * u64::from(width);
+        let expected = row.checked_mul(u64::from(height));
+        if encoding != "rgb8"
+            || width == 0
+            || !width.is_multiple_of(2)
+            || u64::from(step) != row
+            || Some(rgb.len() as u64) != expected
+        {
+            return Err(InvalidScores {
+                height,
+                width,
+                encoding: encoding.to_owned(),
+                bytes: rgb.len(),
+                step,
+            });
+        }
+        Ok(Self {
+            stamp,
+            rows: height as usize,
+            cols: width as usize,
+            rgb,
+        })
+    }
+}
+
 #[cfg(test)]
 pub(crate) mod tests {
     use super::*;
@@ -228,5 +278,24 @@ pub(crate) mod tests {
         let mut long = plan(1);
         long.points = vec![Point::default(); MOST_POINTS + 1];
         assert!(error(long).starts_with("trajectory has 10001 points"));
+    }
+
+    #[test]
+    fn score_maps_of_a_size_that_does_not_fit_are_refused() {
+        let maps = |size, encoding: &str, step, bytes| {
+            ScoreMaps::side_by_side(Duration::ZERO, size, encoding, step, vec![0; bytes])
+        };
+        let scores = maps([2, 4], "rgb8", 12, 24).unwrap();
+        assert_eq!((scores.rows, scores.cols, scores.rgb.len()), (2, 4, 24));
+        let error = maps([2, 4], "rgb8", 12, 23).unwrap_err().to_string();
+        assert!(error.contains("23 bytes"), "{error}");
+        for (size, encoding, step, bytes) in [
+            ([2, 4], "bgr8", 12, 24),
+            ([2, 4], "rgb8", 16, 24),
+            ([2, 3], "rgb8", 9, 18),
+            ([2, 0], "rgb8", 0, 0),
+        ] {
+            assert!(maps(size, encoding, step, bytes).is_err(), "{size:?}");
+        }
     }
 }

@@ -24,7 +24,7 @@ use self::view::Compared;
 use crate::preview::{Motion, ScoreMaps};
 
 pub use self::decide::Decision;
-pub use self::health::NodeReport;
+pub use self::health::{InvalidJoints, Joints, NodeReport};
 pub(crate) use self::outcome::outcome_words;
 pub use self::propose::Pose;
 pub use self::snapshot::{MotionState, Snapshot};

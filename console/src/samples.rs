@@ -8,7 +8,7 @@ use nalgebra::{Isometry2, Point2};
 use pick_place::{PickPlace, PrimitiveSettings};
 use step_protocol::{Coverage, Goal, Observation, Proposal, ProposalId, StepOutcome, StepResult};
 
-use crate::run::Watch;
+use crate::run::{Joints, Watch};
 
 /// What is heard of these nodes is stale after 3 s.
 pub(crate) fn watch(nodes: &[&str]) -> Watch {
@@ -19,6 +19,11 @@ pub(crate) fn watch(nodes: &[&str]) -> Watch {
         stale_after: Duration::from_secs(3),
         changes: ChangeRules::default(),
     }
+}
+
+/// A robot of one joint.
+pub(crate) fn joint(name: &str, position_rad: f64) -> Joints {
+    Joints::new(vec![name.to_owned()], vec![position_rad]).unwrap()
 }
 
 /// A table in a corner of the world.

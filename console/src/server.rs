@@ -7,7 +7,9 @@ mod live;
 mod people;
 mod pictures;
 mod policies;
+mod serving;
 
+use std::path::PathBuf;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -18,7 +20,7 @@ use axum::http::StatusCode;
 use axum::http::header::CONTENT_TYPE;
 use axum::middleware;
 use axum::routing::{get, post};
-use serde::Deserialize;
+use serde::{Deserialize, Serialize};
 use tokio::sync::watch;
 use tokio_util::sync::CancellationToken;
 use tracing::warn;
@@ -27,10 +29,15 @@ use self::access::{Failure, guard, not_found, require_token};
 use crate::cameras::Cameras;
 use crate::checkpoints::Checkpoints;
 use crate::library::Libraries;
+use crate::run::{Run, Watch};
+use crate::session::Sessions;
 use crate::state::Console;
 use crate::training::Trainings;
 
 pub use self::access::{Access, InvalidToken};
+pub use self::serving::{
+    AddressFileError, InvalidServer, ListenError, Listening, Server, ServerSettings, TlsFiles,
+};
 
 /// Largest body of a request [bytes].
 const LARGEST_BODY: usize = 16 * 1024;
@@ -83,6 +90,49 @@ const PAGE: [(&str, &str, &[u8]); 8] = [
     ),
 ];
 
+/// What the page shows, and where it finds and keeps it.
+#[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
+#[serde(default)]
+pub struct PageSettings {
+    /// Most people who watch at once.
+    pub max_viewers: usize,
+    /// Who has shown no sign for this long has left (s).
+    pub session_timeout_s: f64,
+    /// Folder of what was taught.
+    pub library: PathBuf,
+    /// Folder of the checkpoints that the policy can be given.
+    pub checkpoints: PathBuf,
+    /// Checkpoint that the policy begins with.
+    pub checkpoint: PathBuf,
+    /// The command `sctn`, which trains.
+    pub sctn: PathBuf,
+    /// Recipe that it trains with.
+    pub recipe: PathBuf,
+    /// Folder of what is trained.
+    pub training: PathBuf,
+    /// Names of the cameras whose views are shown; empty ones count as none.
+    pub cameras: Vec<String>,
+    /// Frame of proposals.
+    pub world_frame: String,
+}
+
+impl Default for PageSettings {
+    fn default() -> Self {
+        Self {
+            max_viewers: 16,
+            session_timeout_s: 60.0,
+            library: "out/library".into(),
+            checkpoints: "config/checkpoints".into(),
+            checkpoint: "config/checkpoints/ten_problems.safetensors".into(),
+            sctn: "sctn".into(),
+            recipe: "config/recipes/taught.yaml".into(),
+            training: "out/training".into(),
+            cameras: ["front", "left", "right"].map(str::to_owned).into(),
+            world_frame: "world".into(),
+        }
+    }
+}
+
 /// What the page shows and changes.
 #[derive(Clone)]
 pub struct Page {
@@ -96,6 +146,28 @@ pub struct Page {
     pub trainings: Arc<Trainings>,
     /// What the cameras see.
     pub cameras: Arc<Cameras>,
+}
+
+impl Page {
+    /// A page of which nothing was heard and nobody looks at.
+    pub fn new(settings: &PageSettings, watch: Watch) -> Self {
+        let timeout = Duration::from_secs_f64(settings.session_timeout_s);
+        let sessions = Sessions::new(settings.max_viewers, timeout);
+        let checkpoints = [settings.checkpoints.clone(), settings.training.clone()];
+        let trainings = Trainings::new(
+            settings.sctn.clone(),
+            settings.recipe.clone(),
+            settings.training.clone(),
+            settings.checkpoint.clone(),
+        );
+        Self {
+            console: Arc::new(Console::new(Run::new(watch), sessions)),
+            libraries: Arc::new(Libraries::new(&settings.library)),
+            checkpoints: Arc::new(Checkpoints::new(checkpoints)),
+            trainings: Arc::new(trainings),
+            cameras: Arc::new(Cameras::new(&settings.cameras, &settings.world_frame)),
+        }
+    }
 }
 
 /// What handlers share.

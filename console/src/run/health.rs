@@ -8,6 +8,7 @@ use serde::Serialize;
 use step_protocol::RunPhase;
 
 use super::Run;
+use crate::preview::MOST_JOINTS;
 
 /// Nodes whose diagnostics are kept.
 const NODES: usize = 64;
@@ -37,6 +38,59 @@ pub struct NodeReport {
     pub message: String,
     /// Keys and values; of `topics`, each topic and how it is heard.
     pub values: Vec<(String, String)>,
+}
+
+impl NodeReport {
+    /// Of a diagnostic status; `None` where its name is not `NODE: PART`.
+    pub fn of_status(
+        name: &str,
+        level: u8,
+        message: String,
+        values: impl IntoIterator<Item = (String, String)>,
+    ) -> Option<Self> {
+        let (node, state) = name.split_once(": ")?;
+        Some(Self {
+            node: node.to_owned(),
+            state: state.to_owned(),
+            level,
+            message,
+            values: values.into_iter().collect(),
+        })
+    }
+}
+
+/// Where the joints are.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Joints {
+    names: Vec<String>,
+    positions_rad: Vec<f64>,
+}
+
+/// Joints that make no sense.
+#[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
+#[error("{names} names and {positions} positions, expected as many of each, at most {MOST_JOINTS}")]
+pub struct InvalidJoints {
+    names: usize,
+    positions: usize,
+}
+
+impl Joints {
+    /// Their names, and a position (rad) for each.
+    ///
+    /// # Errors
+    /// When there are not as many positions as names, or too many.
+    pub fn new(names: Vec<String>, positions_rad: Vec<f64>) -> Result<Self, InvalidJoints> {
+        if names.len() != positions_rad.len() || names.len() > MOST_JOINTS {
+            return Err(InvalidJoints {
+                names: names.len(),
+                positions: positions_rad.len(),
+            });
+        }
+        Ok(Self {
+            names,
+            positions_rad,
+        })
+    }
 }
 
 /// State of the robot as its driver says.
@@ -88,17 +142,12 @@ impl Run {
     }
 
     /// The joints have been read. Returns whether viewers are to be told: they see the arm move.
-    pub fn on_joints(
-        &mut self,
-        names: Vec<String>,
-        positions_rad: Vec<f64>,
-        now: Duration,
-    ) -> bool {
+    pub fn on_joints(&mut self, joints: Joints, now: Duration) -> bool {
         let last = self.joints.as_ref().map(|(heard, ..)| *heard);
         if last.is_some_and(|last| now.saturating_sub(last) < JOINTS_PERIOD) {
             return false;
         }
-        self.joints = Some((now, names, positions_rad));
+        self.joints = Some((now, joints.names, joints.positions_rad));
         self.phase() == RunPhase::Moving
     }
 
@@ -207,4 +256,30 @@ pub(super) struct NodeState<'a> {
     level: u8,
     state: &'a str,
     message: String,
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn joints_without_positions_are_refused() {
+        let names = |count| vec!["elbow_joint".to_owned(); count];
+        let error = Joints::new(names(1), Vec::new()).unwrap_err().to_string();
+        assert!(error.starts_with("1 names and 0 positions"), "{error}");
+        assert!(Joints::new(names(MOST_JOINTS), vec![0.0; MOST_JOINTS]).is_ok());
+        let many = MOST_JOINTS + 1;
+        assert!(Joints::new(names(many), vec![0.0; many]).is_err());
+    }
+
+    #[test]
+    fn a_status_without_a_node_in_its_name_is_no_report() {
+        let of = |name| NodeReport::of_status(name, 0, String::new(), []);
+        assert_eq!(of("motors"), None);
+        let report = of("/camera_fusion: topics").unwrap();
+        assert_eq!(
+            (&*report.node, &*report.state),
+            ("/camera_fusion", "topics")
+        );
+    }
 }

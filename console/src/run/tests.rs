@@ -99,7 +99,7 @@ fn fresh() -> Run {
     hears_camera(&mut run, "/camera_fusion", "0.5");
     run.on_report(report("/suction_executor", "topics", "all well"), NOW);
     run.on_report(report("/suction_executor", "driver", "ready"), NOW);
-    run.on_joints(vec!["elbow".into()], vec![0.0], NOW);
+    run.on_joints(samples::joint("elbow", 0.0), NOW);
     run
 }
 
@@ -660,7 +660,7 @@ fn joints_are_taken_ten_times_a_second_and_shown_while_the_arm_moves() {
     let mut run = proposed();
     let joints = |run: &mut Run, milliseconds, position_rad| {
         let now = NOW + Duration::from_millis(milliseconds);
-        run.on_joints(vec!["elbow".into()], vec![position_rad], now)
+        run.on_joints(samples::joint("elbow", position_rad), now)
     };
     assert!(!joints(&mut run, 200, 1.0), "nothing moves");
     run.on_confirmation(&confirmation(7, Decision::Approve), NOW);

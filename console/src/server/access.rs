@@ -86,6 +86,12 @@ impl Access {
         }
     }
 
+    /// Where it listens.
+    #[cfg(test)]
+    pub(super) fn socket(&self) -> SocketAddr {
+        self.address
+    }
+
     /// Where the page is served, without the token: for logs.
     pub fn address(&self) -> String {
         format!("{}://{}/", self.scheme, self.address)

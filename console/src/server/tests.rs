@@ -18,18 +18,19 @@ const HOST_NAME: &str = "127.0.0.1:8750";
 
 /// A page whose files lie in a folder.
 pub(crate) fn page(console: Console, folder: &Path) -> Page {
-    let trainings = Trainings::new(
-        "no/such/program".into(),
-        "recipe".into(),
-        folder.join("training"),
-        "checkpoint".into(),
-    );
+    let settings = PageSettings {
+        library: folder.join("library"),
+        checkpoint: "checkpoint".into(),
+        sctn: "no/such/program".into(),
+        recipe: "recipe".into(),
+        training: folder.join("training"),
+        cameras: vec!["front".into()],
+        ..PageSettings::default()
+    };
     Page {
         console: Arc::new(console),
-        libraries: Arc::new(Libraries::new(&folder.join("library"))),
         checkpoints: Arc::new(Checkpoints::new([folder.into(), "no/such/folder".into()])),
-        trainings: Arc::new(trainings),
-        cameras: Arc::new(Cameras::new(&["front".into()], "world")),
+        ..Page::new(&settings, crate::samples::watch(&[]))
     }
 }
 

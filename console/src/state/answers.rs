@@ -3,7 +3,7 @@
 use std::path::Path;
 use std::time::Duration;
 
-use step_protocol::{ProposalId, Recovery, RefusalReason};
+use step_protocol::{ProposalId, RECOVERY_TIMEOUT, Recovery, RefusalReason};
 
 use super::home::no_recovery;
 use super::{PolicyState, State};
@@ -13,9 +13,9 @@ use crate::refusal::Refusal;
 pub type Answer<T> = Result<T, String>;
 
 impl State {
-    /// Whether the executor has refused a recovery only because it has not heard yet that the operator is present: the call and
-    /// what is said of the operator come by different ways. Then it is to be called again.
-    pub fn is_presence_unheard<T>(&self, answer: &Answer<T>, now: Duration) -> bool {
+    /// Whether a recovery is to be called again, which was first called at `begun`: the executor has refused it only because it has not
+    /// heard yet that the operator is present. The call and what is said of the operator come by different ways.
+    pub fn repeats_recovery<T>(&self, answer: &Answer<T>, begun: Duration, now: Duration) -> bool {
         let is_present = self
             .sessions
             .presence(now)
@@ -24,7 +24,8 @@ impl State {
             .as_ref()
             .err()
             .map(|text| RefusalReason::of_text(text));
-        is_present && reason == Some(RefusalReason::NobodyPresent)
+        let is_unheard = is_present && reason == Some(RefusalReason::NobodyPresent);
+        is_unheard && now.saturating_sub(begun) < RECOVERY_TIMEOUT
     }
 
     /// The executor has proposed a recovery, which needs an approval or not; or it says why there is none.

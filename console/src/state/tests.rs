@@ -1,12 +1,12 @@
 use super::*;
 use crate::preview::ScoreMaps;
 use crate::preview::tests::{planned, unplanned};
-use crate::run::NodeReport;
+use crate::run::{Joints, NodeReport};
 use crate::samples::{self, result};
 use ::heightmap::Heightmap;
 use bags::DemonstrationStep;
 use pick_place::PrimitiveSettings;
-use step_protocol::{Goal, ProposalStatus, Reward};
+use step_protocol::{Goal, ProposalStatus, RECOVERY_TIMEOUT, Reward};
 
 const SETTINGS: PrimitiveSettings = PrimitiveSettings::RIGID;
 
@@ -43,7 +43,7 @@ pub(crate) fn proposed() -> (Console, ViewerId, mpsc::UnboundedReceiver<Command>
     let ada = console.change(|state, now| {
         let ada = state.sessions.join("Ada", "key".into(), now).unwrap();
         state.sessions.take(ada, None).unwrap();
-        state.run.on_joints(Vec::new(), Vec::new(), now);
+        state.run.on_joints(Joints::default(), now);
         state.on_heightmap(heightmap(0, 0.0), now);
         state.run.on_goal(goal("", false), now).unwrap();
         state.run.on_proposal(proposal(7, "")).unwrap();
@@ -109,7 +109,7 @@ pub(crate) fn with_everything() -> Console {
         let later = now + Duration::from_secs(1);
         state
             .run
-            .on_joints(vec!["elbow_joint".into()], vec![1.0], later);
+            .on_joints(samples::joint("elbow_joint", 1.0), later);
         state.policy = Some(PolicyState {
             checkpoint: "new.safetensors".into(),
             previous: "old.safetensors".into(),
@@ -527,7 +527,7 @@ fn a_run_of_a_taught_task_is_counted_with_its_checkpoint_when_the_policy_has_mov
     // The one of before has no checkpoint.
     console.change(|state, now| {
         state.run = Run::new(samples::watch(&[]));
-        state.run.on_joints(Vec::new(), Vec::new(), now);
+        state.run.on_joints(Joints::default(), now);
         state.on_heightmap(heightmap(0, 0.0), now);
         state.on_goal(goal("blocks/0", false), now).unwrap();
         state.on_proposal(proposal(7, "any_start"), now).unwrap();
@@ -660,18 +660,25 @@ fn what_the_graph_answers_is_said_and_a_stopped_run_that_goes_on_is_shown_so() {
 #[test]
 fn a_recovery_is_called_for_again_where_the_executor_has_not_heard_of_the_operator() {
     let (console, _, _commands) = proposed();
-    let unheard = |reason: &str| {
+    let absent = "no operator is present (require_presence)";
+    // So long after the first call.
+    let repeats = |reason: &str, waited| {
         let answer: Answer<()> = Err(reason.to_owned());
-        console.read(|state, now| state.is_presence_unheard(&answer, now))
+        console.read(|state, now| state.repeats_recovery(&answer, now, now + waited))
     };
-    assert!(unheard("no operator is present (require_presence)"));
-    assert!(!unheard("the arm is on its way home"));
+    let moment = Duration::from_millis(100);
+    assert!(repeats(absent, moment));
+    assert!(!repeats("the arm is on its way home", moment));
     // Then it is right.
-    let late = |state: &State, now| {
-        let answer: Answer<()> = Err("no operator is present (require_presence)".to_owned());
-        state.is_presence_unheard(&answer, now + Duration::from_secs(5))
+    assert!(!repeats(absent, Duration::from_secs(5)));
+    // The page is in sight, but the executor hears nothing of it.
+    let heard = |state: &mut State, now| {
+        let ada = state.sessions.operator().unwrap();
+        state.sessions.heard(ada, true, now + RECOVERY_TIMEOUT);
     };
-    assert!(!console.read(late));
+    console.change_quietly(heard);
+    assert!(repeats(absent, RECOVERY_TIMEOUT - moment));
+    assert!(!repeats(absent, RECOVERY_TIMEOUT));
 }
 
 #[test]

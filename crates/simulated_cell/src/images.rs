@@ -143,7 +143,7 @@ impl SimulatedCell {
 }
 
 #[cfg(test)]
-mod tests {
+pub(crate) mod tests {
     use super::*;
     use crate::Wiring;
     use camera_noise::Perturbation;
@@ -151,7 +151,8 @@ mod tests {
     use multiravens::Problem;
     use ur5::WorkCell;
 
-    fn shots(perturbation: Option<&str>) -> Vec<(usize, usize, Duration, Vec<u8>)> {
+    /// A cell whose cameras see as a file of config/perturbations says.
+    pub(crate) fn cell(perturbation: Option<&str>) -> SimulatedCell {
         let problem = include_str!("../../../config/problems/placing.yaml");
         let problem = Problem::parse("placing", problem).unwrap();
         let perturbation = perturbation.map(|text| Perturbation::parse("p.yaml", text).unwrap());
@@ -161,8 +162,11 @@ mod tests {
         };
         let hardware = HardwareSettings::default();
         let work_cell = WorkCell::builtin().unwrap();
-        let cell = SimulatedCell::new(&problem, &work_cell, 10_000, wiring, perturbation, hardware);
-        let (mut cell, mut shots) = (cell.unwrap(), Vec::new());
+        SimulatedCell::new(&problem, &work_cell, 10_000, wiring, perturbation, hardware).unwrap()
+    }
+
+    fn shots(perturbation: Option<&str>) -> Vec<(usize, usize, Duration, Vec<u8>)> {
+        let (mut cell, mut shots) = (cell(perturbation), Vec::new());
         cell.take_images(|shot| {
             shots.push((shot.set, shot.index, shot.time, shot.image.rgb.clone()));
             Ok::<_, RenderError>(())

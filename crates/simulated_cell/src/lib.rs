@@ -19,6 +19,8 @@
 //! ```
 
 mod images;
+mod schedule;
+mod shutter;
 
 use std::collections::BTreeMap;
 use std::time::Duration;
@@ -29,6 +31,8 @@ use multiravens::{Assessment, CellError, Environment, EnvironmentError, MotionEn
 use ur5::{JointTrajectory, Joints, PlanError, WorkCell};
 
 pub use self::images::{NOISY_PERIOD, Shot, StillScene};
+pub use self::schedule::{MotionTicks, Pace, PublishSchedule};
+pub use self::shutter::Shutter;
 
 /// Digital pins of a UR controller: 0 to 7 standard, 8 to 15 configurable, 16 and 17 at the tool.
 const PINS: u8 = 18;
@@ -162,6 +166,8 @@ pub enum BeginError {
 
 /// Session of perturbed cameras: light, colours and noise are those of another day than a demonstration's of the same seed.
 const SESSION: u64 = 1;
+/// The most that simulated time catches up at once.
+const MOST_CATCH_UP: Duration = Duration::from_millis(200);
 /// Time between the end of an episode and the beginning of the next.
 const PAUSE: Duration = Duration::from_secs(1);
 
@@ -397,6 +403,18 @@ impl SimulatedCell {
         let passed = self.environment.cell_mut().pass_time();
         self.update_vacuum(now, false);
         passed
+    }
+
+    /// Lets time go on to `until` while no goal is active. A host that is behind catches up little by little: each call brings 0.2 s at most.
+    ///
+    /// # Errors
+    /// When the physics has failed.
+    pub fn catch_up(&mut self, until: Duration, now: Duration) -> Result<(), CellError> {
+        let until = until.min(self.time() + MOST_CATCH_UP);
+        while self.time() < until {
+            self.pass_time(now)?;
+        }
+        Ok(())
     }
 
     /// The speed slider was moved: what is left of the motion under way goes on at so much of its present speed. The arm lags by as much of its
@@ -747,6 +765,21 @@ mod tests {
         assert!(matches!(cell.step(NOW), Step::Failed(_)));
         assert_eq!((cell.time(), cell.joints_rad()), (time, joints));
         assert_eq!(cell.velocities_rad_s(), Joints::zeros());
+    }
+
+    #[test]
+    fn time_catches_up_little_by_little() {
+        let (mut cell, _) = cell();
+        let start = cell.time();
+        let until = start + Duration::from_millis(300);
+        cell.catch_up(until, NOW).unwrap();
+        let first = cell.time() - start;
+        assert!(first >= MOST_CATCH_UP && first < until - start, "{first:?}");
+        cell.catch_up(until, NOW).unwrap();
+        let reached = cell.time();
+        assert!(reached >= until);
+        cell.catch_up(until, NOW).unwrap();
+        assert_eq!(cell.time(), reached);
     }
 
     fn behaving(hardware: HardwareSettings) -> (SimulatedCell, WorkCell) {

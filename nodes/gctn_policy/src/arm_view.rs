@@ -3,7 +3,6 @@
 use std::future::pending;
 use std::time::Duration;
 
-use anyhow::Context as _;
 use msgs::{convert, sensor_msgs::JointState};
 use node_kit::{Node, Qos, Subscription};
 use ur5::{AtHome, WorkCell};
@@ -20,7 +19,7 @@ pub(crate) struct ArmView {
 
 impl ArmView {
     pub(crate) fn new(node: &Node, parameters: &GctnPolicyParameters) -> anyhow::Result<Self> {
-        let work_cell = WorkCell::load_or_builtin(&parameters.urdf).context("parameter urdf")?;
+        let work_cell = node_kit::load_work_cell(&parameters.urdf)?;
         let joint_states = match parameters.observation_needs_home {
             true => Some(node.subscription("joint_states", Qos::Event)?),
             false => None,

@@ -15,7 +15,6 @@ use std::{
 
 use anyhow::{Context as _, bail};
 use gctn::{Decision, Device, GoalConditioning, Policy, Precision};
-use heightmap::ChangeRules;
 use msgs::{
     convert,
     sctn_msgs::{
@@ -25,7 +24,7 @@ use msgs::{
     sensor_msgs::Image,
     visualization_msgs::MarkerArray,
 };
-use node_kit::{Active, Level, Node, Publisher, Qos, ReplyCache, RequestId};
+use node_kit::{Active, Level, NewRequest, Node, Publisher, Qos, ReplyCache};
 use step_protocol::{Job, PlannerRules, Prediction, Proposal, ProposalPlanner};
 use tokio::sync::mpsc;
 use tracing::{info, warn};
@@ -113,7 +112,7 @@ pub struct PolicyNode {
 }
 
 /// A call of `load_checkpoint`, and what came of reading it.
-type Loaded = (RequestId, LoadCheckpointRequest, anyhow::Result<()>);
+type Loaded = (NewRequest, LoadCheckpointRequest, anyhow::Result<()>);
 
 impl Active for PolicyNode {
     /// Begins anew: goal and heightmap are latched, so what is open is proposed again, under the same id.
@@ -125,7 +124,8 @@ impl Active for PolicyNode {
         let mut heightmaps = node.subscription::<Heightmap>("heightmap", Qos::Latched)?;
         // One job at a time: the planner gives the next when it has the answer.
         let (jobs, mut answers) = start_network(node, Arc::clone(&self.policy));
-        let mut load_calls = node.service_server::<LoadCheckpoint>("~/load_checkpoint")?;
+        let mut load_calls =
+            node.idempotent_server::<LoadCheckpoint>("~/load_checkpoint", &self.loads)?;
         let (loaded_sender, mut loaded) = mpsc::unbounded_channel::<Loaded>();
         let mut changes = node.parameters::<GctnPolicyParameters>();
         let rules = rules_of(&changes.borrow_and_update(), &self.checkpoint, node);
@@ -195,44 +195,26 @@ impl Active for PolicyNode {
                     planner.set_rules(rules_of(&changes.borrow_and_update(), &self.checkpoint, node));
                     None
                 }
-                (call, request) = load_calls.recv() => {
-                    let path = self.checkpoint.display().to_string();
-                    let refusal = |message| {
-                        warn!("load_checkpoint: {message}");
-                        LoadCheckpointResponse {
-                            success: false,
-                            message,
-                            path: path.clone(),
-                            previous: path,
-                        }
-                    };
-                    match self.loads.known(&request.request_id, refusal) {
-                        Some(answer) => load_calls.respond(call, answer),
-                        None => {
-                            let policy = Arc::clone(&self.policy);
-                            let sender = loaded_sender.clone();
-                            let device = self.device;
-                            node.spawn_blocking(move || {
-                                let read = load(Path::new(&request.path), device);
-                                // What is being decided is decided first.
-                                let read = read.map(|read| {
-                                    let mut policy = policy.lock().unwrap_or_else(PoisonError::into_inner);
-                                    *policy = LoadedPolicy {
-                                        policy: read,
-                                        checkpoint: PathBuf::from(&request.path),
-                                    };
-                                });
-                                // Nobody waits where the node was deactivated meanwhile.
-                                let _ = sender.send((call, request, read));
-                            });
-                        }
-                    }
+                (call, request) = load_calls.recv(|reason| refused_load(&self.checkpoint, reason)) => {
+                    let (policy, device) = (Arc::clone(&self.policy), self.device);
+                    let sender = loaded_sender.clone();
+                    node.spawn_blocking(move || {
+                        let path = Path::new(&request.path);
+                        let read = load(path, device).map(|read| {
+                            // What is being decided is decided first.
+                            let mut policy = policy.lock().unwrap_or_else(PoisonError::into_inner);
+                            *policy = LoadedPolicy {
+                                policy: read,
+                                checkpoint: path.to_owned(),
+                            };
+                        });
+                        // Nobody waits where the node was deactivated meanwhile.
+                        let _ = sender.send((call, request, read));
+                    });
                     None
                 }
                 Some((call, request, read)) = loaded.recv() => {
-                    let answer = self.answer_of_load(request.path, read);
-                    self.loads.remember(&request.request_id, answer.clone());
-                    load_calls.respond(call, answer);
+                    load_calls.respond(call, self.answer_of_load(request.path, read));
                     None
                 }
             };
@@ -248,24 +230,29 @@ impl Active for PolicyNode {
 impl PolicyNode {
     /// The answer to a call of `load_checkpoint`; where it was read, it is the one in use from now on.
     fn answer_of_load(&mut self, path: String, read: anyhow::Result<()>) -> LoadCheckpointResponse {
-        let previous = self.checkpoint.display().to_string();
-        let (success, message) = match read {
-            Ok(()) => {
-                info!("checkpoint {path} loaded");
-                self.checkpoint = PathBuf::from(&path);
-                (true, format!("checkpoint {path} is in use"))
-            }
-            Err(error) => {
-                warn!("load_checkpoint: {error:#}");
-                (false, format!("{error:#}"))
-            }
-        };
-        LoadCheckpointResponse {
-            success,
-            message,
-            path: self.checkpoint.display().to_string(),
-            previous,
+        if let Err(error) = read {
+            return refused_load(&self.checkpoint, format!("{error:#}"));
         }
+        info!("checkpoint {path} loaded");
+        let previous = std::mem::replace(&mut self.checkpoint, PathBuf::from(&path));
+        LoadCheckpointResponse {
+            success: true,
+            message: format!("checkpoint {path} is in use"),
+            path,
+            previous: previous.display().to_string(),
+        }
+    }
+}
+
+/// The checkpoint in use stays.
+fn refused_load(checkpoint: &Path, message: String) -> LoadCheckpointResponse {
+    warn!("load_checkpoint: {message}");
+    let path = checkpoint.display().to_string();
+    LoadCheckpointResponse {
+        success: false,
+        message,
+        path: path.clone(),
+        previous: path,
     }
 }
 
@@ -279,10 +266,7 @@ fn confirm(planner: &mut ProposalPlanner, message: &StepConfirmation) {
 fn rules_of(parameters: &GctnPolicyParameters, checkpoint: &Path, node: &Node) -> PlannerRules {
     let checkpoint = checkpoint.file_stem().unwrap_or_default();
     PlannerRules {
-        changes: ChangeRules::new(
-            parameters.observation_tolerance_m,
-            1e-6 * parameters.observation_changed_area_mm2,
-        ),
+        changes: parameters.changes.rules(),
         rejected_radius_m: parameters.exclusion_radius_m,
         checkpoint: checkpoint.to_string_lossy().into_owned(),
         author: node.name().to_owned(),

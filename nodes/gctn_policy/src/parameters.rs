@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use gctn::Device;
-use node_kit::{InvalidParameter, Parameters, Range};
+use node_kit::{ChangeParameters, InvalidParameter, Parameters, Range};
 use serde::{Deserialize, Serialize};
 
 /// Explained in config/gctn_policy.yaml.
@@ -15,8 +15,8 @@ pub struct GctnPolicyParameters {
     pub threads: usize,
     pub device: Device,
     pub exclusion_radius_m: f64,
-    pub observation_tolerance_m: f64,
-    pub observation_changed_area_mm2: f64,
+    #[serde(flatten)]
+    pub changes: ChangeParameters,
     pub observation_needs_home: bool,
     pub urdf: PathBuf,
 }
@@ -28,8 +28,7 @@ impl Default for GctnPolicyParameters {
             threads: 1,
             device: Device::Cpu,
             exclusion_radius_m: 0.02,
-            observation_tolerance_m: 0.005,
-            observation_changed_area_mm2: 75.0,
+            changes: ChangeParameters::default(),
             observation_needs_home: false,
             urdf: PathBuf::new(),
         }
@@ -54,11 +53,10 @@ impl Parameters for GctnPolicyParameters {
     const RANGES: &'static [(&'static str, Range)] = &[
         ("threads", Range::Integer(1, 256)),
         ("exclusion_radius_m", Range::POSITIVE),
-        ("observation_tolerance_m", Range::POSITIVE),
-        ("observation_changed_area_mm2", Range::POSITIVE),
+        ChangeParameters::RANGES[0],
+        ChangeParameters::RANGES[1],
     ];
-    const CHANGEABLE: &'static [&'static str] =
-        &["observation_tolerance_m", "observation_changed_area_mm2"];
+    const CHANGEABLE: &'static [&'static str] = &ChangeParameters::NAMES;
 }
 
 #[cfg(test)]

@@ -104,9 +104,11 @@ impl Active for OracleNode {
         let mut confirmations =
             node.subscription::<StepConfirmation>("step_confirmation", Qos::Event)?;
         let mut heightmaps = node.subscription::<Heightmap>("heightmap", Qos::Latched)?;
-        let mut load = node.service_server::<LoadDemonstration>("~/load_demonstration")?;
-        let mut capture = node.service_server::<CaptureGoal>("~/capture_goal")?;
-        let mut set_step = node.service_server::<SetStep>("~/set_step")?;
+        let mut load =
+            node.idempotent_server::<LoadDemonstration>("~/load_demonstration", &self.loads)?;
+        let mut capture =
+            node.idempotent_server::<CaptureGoal>("~/capture_goal", &self.captures)?;
+        let mut set_step = node.idempotent_server::<SetStep>("~/set_step", &self.steps)?;
         // The newest that comes from now on.
         self.newest = None;
 
@@ -148,12 +150,12 @@ impl Active for OracleNode {
                         Change::None
                     })
                 }
-                (call, request) = load.recv() => {
+                (call, request) = load.recv(refused_load) => {
                     let (response, change) = self.load(request).await;
                     load.respond(call, response);
                     change
                 }
-                (call, request) = capture.recv() => {
+                (call, request) = capture.recv(|reason| refused_capture(&self.tracker, reason)) => {
                     // What was seen before the call is to be known before it.
                     while let Some(heightmap) = heightmaps.try_recv() {
                         if let Err(reason) = self.observed(heightmap) {
@@ -164,7 +166,7 @@ impl Active for OracleNode {
                     capture.respond(call, response);
                     change
                 }
-                (call, request) = set_step.recv() => {
+                (call, request) = set_step.recv(|reason| refused_step(&self.tracker, reason)) => {
                     let (response, change) = self.set_step(&request);
                     set_step.respond(call, response);
                     change
@@ -369,21 +371,11 @@ impl OracleNode {
         &mut self,
         request: LoadDemonstrationRequest,
     ) -> (LoadDemonstrationResponse, Change) {
-        let refusal = |message: String| {
-            warn!("load_demonstration: {message}");
-            LoadDemonstrationResponse {
-                message,
-                ..Default::default()
-            }
-        };
-        if let Some(answer) = self.loads.known(&request.request_id, refusal) {
-            return (answer, Change::None);
-        }
         let reading = self
             .node
             .spawn_blocking(move || read_goals(Path::new(&request.path)));
         let read = reading.await.context("reading panicked").flatten();
-        let (answer, change) = match read {
+        match read {
             Ok(sequence) => {
                 let goals = &sequence.goals;
                 let name = goals.first().map(|goal| goal.demonstration.clone());
@@ -398,26 +390,12 @@ impl OracleNode {
                 self.matcher.forget();
                 (answer, self.tracker.load(sequence))
             }
-            Err(error) => (refusal(format!("{error:#}")), Change::None),
-        };
-        self.loads.remember(&request.request_id, answer.clone());
-        (answer, change)
+            Err(error) => (refused_load(format!("{error:#}")), Change::None),
+        }
     }
 
     fn capture(&mut self, request: CaptureGoalRequest) -> (CaptureGoalResponse, Change) {
-        let (_, count, _) = self.tracker.progress();
-        let refusal = |message: String| {
-            warn!("capture_goal: {message}");
-            CaptureGoalResponse {
-                message,
-                step_count: count,
-                ..Default::default()
-            }
-        };
-        if let Some(answer) = self.captures.known(&request.request_id, refusal) {
-            return (answer, Change::None);
-        }
-        let (answer, change) = match self.take_capture(&request) {
+        match self.take_capture(&request) {
             Ok((stamp, step, change)) => {
                 let (_, step_count, _) = self.tracker.progress();
                 let answer = CaptureGoalResponse {
@@ -430,10 +408,8 @@ impl OracleNode {
                 info!("captured {} as step {step} of {step_count}", answer.message);
                 (answer, change)
             }
-            Err(reason) => (refusal(reason), Change::None),
-        };
-        self.captures.remember(&request.request_id, answer.clone());
-        (answer, change)
+            Err(reason) => (refused_capture(&self.tracker, reason), Change::None),
+        }
     }
 
     fn take_capture(
@@ -477,26 +453,46 @@ impl OracleNode {
     }
 
     fn set_step(&mut self, request: &SetStepRequest) -> (SetStepResponse, Change) {
-        let answer = |(step, step_count, attempt), success, message| SetStepResponse {
-            success,
-            message,
-            step,
-            step_count,
-            attempt,
-        };
-        let before = self.tracker.progress();
-        let refusal = |reason: String| {
-            warn!("set_step: {reason}");
-            answer(before, false, reason)
-        };
-        if let Some(answer) = self.steps.known(&request.request_id, refusal) {
-            return (answer, Change::None);
+        match self.tracker.set_step(request.step) {
+            Ok(change) => {
+                let answer = step_response(&self.tracker, true, String::new());
+                (answer, change)
+            }
+            Err(none) => (refused_step(&self.tracker, none.to_string()), Change::None),
         }
-        let (answer, change) = match self.tracker.set_step(request.step) {
-            Ok(change) => (answer(self.tracker.progress(), true, String::new()), change),
-            Err(none) => (refusal(none.to_string()), Change::None),
-        };
-        self.steps.remember(&request.request_id, answer.clone());
-        (answer, change)
+    }
+}
+
+fn refused_load(message: String) -> LoadDemonstrationResponse {
+    warn!("load_demonstration: {message}");
+    LoadDemonstrationResponse {
+        message,
+        ..Default::default()
+    }
+}
+
+fn refused_capture(tracker: &GoalTracker, message: String) -> CaptureGoalResponse {
+    warn!("capture_goal: {message}");
+    let (_, step_count, _) = tracker.progress();
+    CaptureGoalResponse {
+        message,
+        step_count,
+        ..Default::default()
+    }
+}
+
+fn refused_step(tracker: &GoalTracker, message: String) -> SetStepResponse {
+    warn!("set_step: {message}");
+    step_response(tracker, false, message)
+}
+
+fn step_response(tracker: &GoalTracker, success: bool, message: String) -> SetStepResponse {
+    let (step, step_count, attempt) = tracker.progress();
+    SetStepResponse {
+        success,
+        message,
+        step,
+        step_count,
+        attempt,
     }
 }

@@ -2,15 +2,15 @@
 
 use std::path::PathBuf;
 use std::sync::Arc;
-use std::time::Instant;
 
-use console::{Answer, Command, Console, Page, PolicyState};
-use msgs::convert;
+use console::{Answer, Command, Page, PolicyState};
 use msgs::sctn_msgs::{
-    LoadCheckpoint, LoadCheckpointRequest, LoadDemonstration, LoadDemonstrationRequest,
-    OperatorPresence, PickPlace, ProposeHome, ProposeHomeRequest, SetStep, SetStepRequest,
+    LoadCheckpoint, LoadCheckpointRequest, LoadCheckpointResponse, LoadDemonstration,
+    LoadDemonstrationRequest, LoadDemonstrationResponse, OperatorPresence, PickPlace, ProposeHome,
+    ProposeHomeRequest, ProposeHomeResponse, SetStep, SetStepRequest, SetStepResponse,
     StepConfirmation,
 };
+use msgs::{Service, convert};
 use node_kit::{CallOptions, Node, Publisher, Qos, ServiceClient};
 use step_protocol::{
     Confirmation, PRESENCE_PERIOD, Proposal, ProposalId, RECOVERY_TIMEOUT, Recovery,
@@ -55,10 +55,6 @@ impl Commands {
             load: Arc::new(node.service_client(&format!("{goal_oracle}/load_demonstration"))?),
             load_checkpoint: Arc::new(node.service_client(&format!("{policy}/load_checkpoint"))?),
         })
-    }
-
-    fn console(&self) -> Arc<Console> {
-        Arc::clone(&self.page.console)
     }
 
     /// Says whether the operator is present.
@@ -134,13 +130,12 @@ impl Commands {
         };
         info!("`{name}` asks for {recovery:?}");
         self.publish_presence(node);
-        let (client, console) = (Arc::clone(client), self.console());
+        let (client, console) = (Arc::clone(client), Arc::clone(&self.page.console));
         node.spawn(async move {
-            let deadline = Instant::now() + RECOVERY_TIMEOUT;
+            let begun = console.now();
             let answer = loop {
                 let answer = propose_recovery(&client).await;
-                let is_unheard = console.read(|state, now| state.is_presence_unheard(&answer, now));
-                if !is_unheard || Instant::now() >= deadline {
+                if !console.read(|state, now| state.repeats_recovery(&answer, begun, now)) {
                     break answer;
                 }
                 tokio::time::sleep(PRESENCE_PERIOD).await;
@@ -151,17 +146,14 @@ impl Commands {
 
     fn set_step(&self, node: &Node, step: u32, name: &str) {
         info!("`{name}`: continue with step {step}");
-        let (client, console) = (Arc::clone(&self.set_step), self.console());
+        let (client, console) = (Arc::clone(&self.set_step), Arc::clone(&self.page.console));
         let request = SetStepRequest {
             request_id: console::secret(),
             step,
         };
         node.spawn(async move {
-            let answer = match client.call(&request, &CallOptions::default()).await {
-                Ok(answer) if answer.success => Ok(()),
-                Ok(answer) => Err(answer.message),
-                Err(error) => Err(error.to_string()),
-            };
+            let read = |said: SetStepResponse| (said.success, said.message, ());
+            let answer = ask(&client, &request, &CallOptions::default(), read).await;
             console.change(|state, now| state.on_set_step_answer(answer, now));
         });
     }
@@ -180,11 +172,10 @@ impl Commands {
                 error!("reading a demonstration: {error}");
                 None
             });
-            let answer = match client.call(&request, &CallOptions::default()).await {
-                Ok(answer) if answer.success => Ok(answer.message),
-                Ok(answer) => Err(answer.message),
-                Err(error) => Err(error.to_string()),
+            let read = |said: LoadDemonstrationResponse| {
+                (said.success, said.message.clone(), said.message)
             };
+            let answer = ask(&client, &request, &CallOptions::default(), read).await;
             page.console.change(|state, now| {
                 state.on_load_answer(demonstration, goals, answer, now);
             });
@@ -199,19 +190,15 @@ impl Commands {
             path: path.display().to_string(),
         };
         node.spawn(async move {
-            let answer = match client.call(&request, &CallOptions::default()).await {
-                Ok(answer) if answer.success => Ok(PolicyState {
-                    checkpoint: answer.path,
-                    previous: answer.previous,
-                }),
-                Ok(answer) => Err(answer.message),
-                Err(error) => Err(error.to_string()),
+            let read = |said: LoadCheckpointResponse| {
+                let policy = PolicyState {
+                    checkpoint: said.path,
+                    previous: said.previous,
+                };
+                (said.success, said.message, policy)
             };
-            if let Ok(policy) = &answer {
-                page.trainings.begin_with(&policy.checkpoint);
-            }
-            page.console
-                .change(|state, now| state.on_checkpoint_answer(&path, answer, now));
+            let answer = ask(&client, &request, &CallOptions::default(), read).await;
+            page.on_checkpoint_answer(&path, answer);
         });
     }
 }
@@ -222,9 +209,24 @@ async fn propose_recovery(client: &ServiceClient<ProposeHome>) -> Answer<(Propos
         attempts: 1,
         timeout: RECOVERY_TIMEOUT,
     };
-    match client.call(&ProposeHomeRequest::default(), &options).await {
-        Ok(answer) if answer.success => Ok((ProposalId(answer.proposal_id), answer.needs_approval)),
-        Ok(answer) => Err(answer.message),
+    let read = |said: ProposeHomeResponse| {
+        let proposed = (ProposalId(said.proposal_id), said.needs_approval);
+        (said.success, said.message, proposed)
+    };
+    ask(client, &ProposeHomeRequest::default(), &options, read).await
+}
+
+/// What a service has done, or why not. `read`: whether it has, its reason why not, and what.
+async fn ask<S: Service, T>(
+    client: &ServiceClient<S>,
+    request: &S::Request,
+    options: &CallOptions,
+    read: impl FnOnce(S::Response) -> (bool, String, T),
+) -> Answer<T> {
+    let said = client.call(request, options).await;
+    match said.map(read) {
+        Ok((true, _, done)) => Ok(done),
+        Ok((false, reason, _)) => Err(reason),
         Err(error) => Err(error.to_string()),
     }
 }

@@ -6,16 +6,12 @@ mod commands;
 mod convert;
 mod parameters;
 
-use std::path::Path;
-use std::pin::Pin;
+use std::future::Future;
 use std::sync::Arc;
 use std::time::Duration;
 
 use anyhow::Context as _;
-use console::{
-    Access, Cameras, Checkpoints, Console, Libraries, Listener, Page, Run, Sessions, TlsAcceptor,
-    Trainings, Watch,
-};
+use console::{Console, Joints, Page, Server, Watch};
 use msgs::convert::{
     confirmation_from_msg, confirmation_refused_from_msg, goal_from_msg, observation_from_msg,
     proposal_from_msg, result_from_msg, reward_from_msg,
@@ -36,32 +32,20 @@ use tokio_util::sync::CancellationToken;
 use tracing::{info, warn};
 
 use crate::commands::Commands;
-use crate::convert::{joints_from_msg, level, motion_from_msg, report_from_msg, scores_from_msg};
+use crate::convert::{level, motion_from_msg, report_from_msg, scores_from_msg};
 
-pub use parameters::{OperatorConsoleParameters, Tls};
+pub use parameters::OperatorConsoleParameters;
 
 /// Reads certificate and key; what it returns serves the page while it is active.
 pub async fn configure(
     node: Node,
     parameters: OperatorConsoleParameters,
 ) -> anyhow::Result<ConsoleNode> {
-    let tls = match parameters.has_tls() {
-        true => {
-            let Tls { certificate, key } = &parameters.tls;
-            Some(
-                console::tls_acceptor(certificate, key)
-                    .context("parameters tls.certificate and tls.key")?,
-            )
-        }
-        false => None,
-    };
+    let server =
+        Server::new(parameters.server.clone()).context("parameters tls.certificate and tls.key")?;
+    let watched = parameters.nodes.iter().filter(|name| !name.is_empty());
     let watch = Watch {
-        nodes: parameters
-            .nodes
-            .iter()
-            .filter(|name| !name.is_empty())
-            .map(|name| node.resolve(name))
-            .collect(),
+        nodes: watched.map(|name| node.resolve(name)).collect(),
         executor: node.resolve(&parameters.executor),
         image_topics: parameters
             .camera_preset
@@ -69,36 +53,13 @@ pub async fn configure(
             .map(str::to_owned)
             .into(),
         stale_after: Duration::from_secs_f64(parameters.stale_after_s),
-        changes: heightmap::ChangeRules::new(
-            parameters.observation_tolerance_m,
-            1e-6 * parameters.observation_changed_area_mm2,
-        ),
+        changes: parameters.changes.rules(),
     };
-    let session_timeout = Duration::from_secs_f64(parameters.session_timeout_s);
-    let sessions = Sessions::new(parameters.max_viewers, session_timeout);
-    let checkpoints = [parameters.checkpoints.clone(), parameters.training.clone()];
-    let trainings = Trainings::new(
-        parameters.sctn.clone(),
-        parameters.recipe.clone(),
-        parameters.training.clone(),
-        parameters.checkpoint.clone(),
-    );
-    let cameras = Cameras::new(&parameters.cameras, &parameters.world_frame);
-    let page = Page {
-        console: Arc::new(Console::new(Run::new(watch), sessions)),
-        libraries: Arc::new(Libraries::new(&parameters.library)),
-        checkpoints: Arc::new(Checkpoints::new(checkpoints)),
-        trainings: Arc::new(trainings),
-        cameras: Arc::new(cameras),
-    };
+    let page = Page::new(&parameters.page, watch);
     Ok(ConsoleNode {
         commands: Commands::new(&node, &parameters, page.clone())?,
-        token: match parameters.token.as_str() {
-            "" => console::secret(),
-            token => token.to_owned(),
-        },
         page,
-        tls,
+        server,
         parameters,
     })
 }
@@ -106,8 +67,7 @@ pub async fn configure(
 /// The configured node.
 pub struct ConsoleNode {
     parameters: OperatorConsoleParameters,
-    token: String,
-    tls: Option<TlsAcceptor>,
+    server: Server,
     page: Page,
     commands: Commands,
 }
@@ -119,12 +79,7 @@ impl Active for ConsoleNode {
         let end = CancellationToken::new();
         let _ended = end.clone().drop_guard();
         let (page, demonstration) = (self.page.clone(), self.parameters.demonstration.clone());
-        let read = node.spawn_blocking(move || {
-            if demonstration != Path::new("") {
-                page.show_demonstration(&demonstration);
-            }
-            page.resume_run();
-        });
+        let read = node.spawn_blocking(move || page.begin(&demonstration));
         read.await.context("reading the library panicked")?;
         self.serve(node, &end).await?;
         self.follow_cameras(node, &end);
@@ -211,32 +166,20 @@ impl Active for ConsoleNode {
                         reports.for_each(|report| state.run.on_report(report, now));
                     });
                 }
-                message = joints.recv() => match joints_from_msg(message) {
-                    Ok((names, positions_rad)) => {
-                        console.hear(|state, now| state.run.on_joints(names, positions_rad, now));
-                    }
+                message = joints.recv() => match Joints::new(message.name, message.position) {
+                    Ok(read) => console.hear(|state, now| state.run.on_joints(read, now)),
                     Err(error) => joints.reject(error),
                 },
-                message = heartbeats.recv() => {
-                    console.change_quietly(|state, now| state.run.on_motion(message.data, now));
-                }
+                message = heartbeats.recv() => console.change_quietly(|state, now| state.run.on_motion(message.data, now)),
                 message = pins.recv() => {
                     let suction = level(&message.digital_out_states, self.parameters.suction_pin);
                     let vacuum = level(&message.digital_in_states, self.parameters.vacuum_pin);
                     console.hear(|state, _| state.run.on_pins(suction, vacuum));
                 }
-                message = robot_modes.recv() => {
-                    console.change(|state, _| state.run.on_robot_mode(message.mode));
-                }
-                message = safety_modes.recv() => {
-                    console.change(|state, _| state.run.on_safety_mode(message.mode));
-                }
-                message = speeds.recv() => {
-                    console.change_quietly(|state, _| state.run.on_speed_scaling(message.data));
-                }
-                message = running.recv() => {
-                    console.change(|state, _| state.run.on_program(message.data));
-                }
+                message = robot_modes.recv() => console.change(|state, _| state.run.on_robot_mode(message.mode)),
+                message = safety_modes.recv() => console.change(|state, _| state.run.on_safety_mode(message.mode)),
+                message = speeds.recv() => console.change_quietly(|state, _| state.run.on_speed_scaling(message.data)),
+                message = running.recv() => console.change(|state, _| state.run.on_program(message.data)),
             }
         }
     }
@@ -255,66 +198,51 @@ fn show_proposal(console: &Console, topic: &Subscription<PickPlace>, message: &P
 impl ConsoleNode {
     /// Serves the page until `end`.
     async fn serve(&self, node: &Node, end: &CancellationToken) -> anyhow::Result<()> {
-        let socket = self.parameters.socket()?;
-        let listener = Listener::bind(socket, self.tls.clone())
-            .await
-            .with_context(|| format!("parameters address and port: cannot listen on {socket}"))?;
-        let access = Access::new(
-            self.token.clone(),
-            listener.address(),
-            &self.parameters.host_names,
-            self.tls.is_some(),
-        );
-        let file = &self.parameters.address_file;
-        if file == Path::new("") {
+        let listening = self.server.listen().await;
+        let listening = listening.context("parameters address and port")?;
+        let printed = listening.announce().context("parameter address_file")?;
+        if let Some(address) = printed {
             // Standard output may be a program's result.
-            eprintln!("operator console: {}", access.page());
-        } else {
-            access
-                .write_page(file)
-                .with_context(|| format!("parameter address_file: {}", file.display()))?;
+            eprintln!("operator console: {address}");
         }
         // Logs go to every node: never the token.
-        let served = format!("served on {}", access.address());
+        let served = format!("served on {}", listening.address());
         info!("the operator's page is {served}");
         node.diagnostics().set("page", Level::Ok, served, []);
-        let router = console::router(self.page.clone(), access, end.clone());
-        let ended = end.clone().cancelled_owned();
-        tokio::spawn(async move {
-            let served = axum::serve(listener, router).with_graceful_shutdown(ended);
-            if let Err(error) = served.await {
-                warn!("the page is no longer served: {error}");
-            }
-        });
+        listening.serve(self.page.clone(), end);
         Ok(())
     }
 
     /// Keeps images and transforms until `end`.
     fn follow_cameras(&self, node: &Node, end: &CancellationToken) {
-        let watch =
-            |what: String, work: Pin<Box<dyn Future<Output = anyhow::Result<()>> + Send>>| {
-                let work = end.clone().run_until_cancelled_owned(work);
-                node.spawn(async move {
-                    if let Some(Err(error)) = work.await {
-                        warn!("{what} is not shown: {error:#}");
-                    }
-                });
-            };
         let cameras = || Arc::clone(&self.page.cameras);
         let transforms = cameras::follow_transforms(node.clone(), cameras());
-        watch(
+        spawn_until(
+            node,
+            end,
             "a proposal on the cameras' images".to_owned(),
-            Box::pin(transforms),
+            transforms,
         );
-        for name in self
-            .parameters
-            .cameras
-            .iter()
-            .filter(|name| !name.is_empty())
-        {
+        let names = self.parameters.page.cameras.iter();
+        for name in names.filter(|name| !name.is_empty()) {
             let topics = self.parameters.camera_preset.topics(name);
             let images = cameras::follow(node.clone(), cameras(), name.clone(), topics);
-            watch(format!("camera {name}"), Box::pin(images));
+            spawn_until(node, end, format!("camera {name}"), images);
         }
     }
+}
+
+/// Does `work` until `end`, on a task of its own.
+fn spawn_until(
+    node: &Node,
+    end: &CancellationToken,
+    what: String,
+    work: impl Future<Output = anyhow::Result<()>> + Send + 'static,
+) {
+    let work = end.clone().run_until_cancelled_owned(work);
+    node.spawn(async move {
+        if let Some(Err(error)) = work.await {
+            warn!("{what} is not shown: {error:#}");
+        }
+    });
 }

@@ -4,7 +4,6 @@
 //! same states, frames and stamps, however slow the host. The wall clock decides only how often
 //! what is at rest is said again.
 
-mod hardware;
 mod node;
 mod parameters;
 

@@ -1,4 +1,4 @@
-//! The node: what its services and actions ask is passed on to the thread of `hardware`.
+//! The node: what its services and actions ask is passed on to the emulator's thread.
 
 use std::convert::Infallible;
 use std::path::Path;
@@ -8,20 +8,19 @@ use std::time::SystemTime;
 
 use anyhow::Context as _;
 use camera_noise::Perturbation;
-use cell_emulation::{ActionNames, DriverServer, DriverState, Request};
-use driver_model::HardwareSettings;
-use msgs::sctn_msgs::{ResetCell, ResetCellRequest, ResetCellResponse};
+use cell_emulation::{
+    Command, DriverServer, DriverState, Emulator, EmulatorSettings, Shared, refused_reset,
+};
+use msgs::sctn_msgs::{ResetCell, ResetCellResponse};
 use multiravens::Problem;
-use node_kit::{Active, Node, ServiceServer};
+use node_kit::{Active, IdempotentServer, Node, ReplyCache};
 use simulated_cell::{SimulatedCell, Wiring};
 use tokio::sync::oneshot;
 use tracing::warn;
-use ur5::WorkCell;
 
-use crate::hardware::Hardware;
 use crate::parameters::SimWorkcellParameters;
 
-/// Commands that wait for the hardware's thread; more are refused.
+/// Commands that wait for the emulator's thread; more are refused.
 const WAITING_COMMANDS: usize = 64;
 
 /// Begins the episode and returns the node that emulates the UR driver and the cameras.
@@ -29,11 +28,9 @@ pub async fn configure(
     node: Node,
     parameters: SimWorkcellParameters,
 ) -> anyhow::Result<HardwareNode> {
-    let problem = Problem::load(&parameters.problems_dir, &parameters.problem)?;
-    let work_cell = WorkCell::load_or_builtin(&parameters.urdf).context("parameter urdf")?;
-    if let Some(warning) = work_cell.warning() {
-        warn!("parameter urdf: {warning}");
-    }
+    let settings = parameters.emulator;
+    let problem = Problem::load(&settings.problems_dir, &settings.problem)?;
+    let work_cell = node_kit::load_work_cell(&parameters.urdf)?;
     let wiring = Wiring {
         suction_pin: parameters.suction_pin,
         vacuum_pin: parameters.vacuum_pin,
@@ -42,60 +39,58 @@ pub async fn configure(
         path if path == Path::new("") => None,
         path => Some(Perturbation::load(path).context("parameter perturbation")?),
     };
-    let seed = parameters.seed;
-    let behaviour = parameters.hardware.clone();
     let mut cell = tokio::task::spawn_blocking({
-        let (work_cell, behaviour) = (work_cell.clone(), behaviour.clone());
-        move || SimulatedCell::new(&problem, &work_cell, seed, wiring, perturbation, behaviour)
+        let (work_cell, hardware) = (work_cell.clone(), settings.hardware.clone());
+        let seed = settings.seed;
+        move || SimulatedCell::new(&problem, &work_cell, seed, wiring, perturbation, hardware)
     })
     .await
     .context("setting up the episode")??;
-    if behaviour.free_running {
+    if settings.hardware.free_running {
         let now = SystemTime::now().duration_since(SystemTime::UNIX_EPOCH);
         cell.begin_at(now.context("the clock is before 1970")?);
     }
-    let actions = parameters.actions();
     let shared = Arc::new(Shared {
         stop: AtomicBool::new(false),
-        driver: Arc::new(DriverState::new(&actions, &behaviour)),
+        driver: Arc::new(DriverState::new(&settings.actions(), &settings.hardware)),
     });
     let (sender, commands) = mpsc::sync_channel(WAITING_COMMANDS);
-    let hardware = Hardware::new(
+    let reading = node.clone();
+    let newer_settings = move |known: &EmulatorSettings| {
+        let parameters = reading.parameters::<SimWorkcellParameters>();
+        let now = &parameters.borrow().emulator;
+        (now != known).then(|| now.clone())
+    };
+    let emulator = Emulator::new(
         &node,
-        parameters,
+        settings.clone(),
+        newer_settings,
         cell,
         work_cell,
         commands,
         Arc::clone(&shared),
     )?;
     Ok(HardwareNode {
-        hardware: Some(hardware),
+        emulator: Some(emulator),
         sender,
         shared,
-        behaviour,
-        actions,
+        settings,
+        resets: ReplyCache::default(),
     })
-}
-
-/// What the services and the hardware's thread share.
-pub(crate) struct Shared {
-    /// The node is no longer active.
-    pub(crate) stop: AtomicBool,
-    pub(crate) driver: Arc<DriverState>,
 }
 
 /// The configured node. While it is inactive the cell stays as it is, and nothing is said.
 pub struct HardwareNode {
     /// Its thread has it while the node is active.
-    hardware: Option<Hardware>,
+    emulator: Option<Emulator>,
     sender: mpsc::SyncSender<Command>,
     shared: Arc<Shared>,
-    behaviour: HardwareSettings,
-    actions: ActionNames,
+    settings: EmulatorSettings,
+    resets: ReplyCache<ResetCellResponse>,
 }
 
 impl Drop for HardwareNode {
-    /// Where the runtime ends without deactivation, the hardware's thread ends too.
+    /// Where the runtime ends without deactivation, the emulator's thread ends too.
     fn drop(&mut self) {
         self.shared.stop.store(true, Ordering::Release);
     }
@@ -104,44 +99,46 @@ impl Drop for HardwareNode {
 impl Active for HardwareNode {
     async fn run(&mut self, node: &Node) -> anyhow::Result<()> {
         let state = Arc::clone(&self.shared.driver);
-        let mut driver = DriverServer::new(node, &self.actions, &self.behaviour, state)?;
-        let resets = node.service_server::<ResetCell>("~/reset")?;
-        let hardware = self.hardware.take();
-        let mut hardware = hardware.context("the hardware's thread has not ended")?;
+        let EmulatorSettings { hardware, .. } = &self.settings;
+        let mut driver = DriverServer::new(node, &self.settings.actions(), hardware, state)?;
+        let resets = node.idempotent_server::<ResetCell>("~/reset", &self.resets)?;
+        let emulator = self.emulator.take();
+        let mut emulator = emulator.context("the emulator's thread has not ended")?;
         self.shared.stop.store(false, Ordering::Release);
         let mut thread = node.spawn_blocking(move || {
-            let ended = hardware.run();
-            (hardware, ended)
+            let ended = emulator.run();
+            (emulator, ended)
         });
         let sender = &self.sender;
-        tokio::select! {
+        let ended = tokio::select! {
             never = driver.serve(|request| pass_on(sender, Command::Driver(request))) => match never {},
             never = serve_resets(resets, sender) => match never {},
-            ended = &mut thread => ended.context("the hardware's thread panicked")?.1,
+            ended = &mut thread => ended.context("the emulator's thread panicked")?.1,
             () = node.deactivated() => {
                 self.shared.stop.store(true, Ordering::Release);
-                let (hardware, ended) = thread.await.context("the hardware's thread panicked")?;
-                self.hardware = Some(hardware);
+                let (emulator, ended) = thread.await.context("the emulator's thread panicked")?;
+                self.emulator = Some(emulator);
                 ended
             }
-        }
+        };
+        Ok(ended?)
     }
 }
 
 /// Passes resets on, one after the other.
 async fn serve_resets(
-    mut resets: ServiceServer<ResetCell>,
+    mut resets: IdempotentServer<ResetCell>,
     sender: &mpsc::SyncSender<Command>,
 ) -> Infallible {
     loop {
-        let (id, request) = resets.recv().await;
+        let (call, request) = resets.recv(refused_reset).await;
         let (reply, replied) = oneshot::channel();
         pass_on(sender, Command::Reset(request, reply));
-        let refused = |_| ResetCellResponse {
-            message: "too many other commands wait".into(),
-            ..Default::default()
-        };
-        resets.respond(id, replied.await.unwrap_or_else(refused));
+        let dropped = |_| Err("too many other commands wait".to_owned());
+        match replied.await.unwrap_or_else(dropped) {
+            Ok(answer) => resets.respond(call, answer),
+            Err(reason) => resets.respond_for_now(call, refused_reset(reason)),
+        }
     }
 }
 
@@ -150,10 +147,4 @@ fn pass_on(sender: &mpsc::SyncSender<Command>, command: Command) {
     if sender.try_send(command).is_err() {
         warn!("command refused: {WAITING_COMMANDS} others wait");
     }
-}
-
-/// What the services and action servers ask of the hardware's thread.
-pub(crate) enum Command {
-    Driver(Request),
-    Reset(ResetCellRequest, oneshot::Sender<ResetCellResponse>),
 }

@@ -2,8 +2,7 @@
 
 use std::path::PathBuf;
 
-use cell_emulation::ActionNames;
-use driver_model::HardwareSettings;
+use cell_emulation::EmulatorSettings;
 use node_kit::{Parameters, Range};
 use serde::{Deserialize, Serialize};
 
@@ -11,70 +10,27 @@ use serde::{Deserialize, Serialize};
 #[derive(Clone, Debug, PartialEq, Serialize, Deserialize)]
 #[serde(default, deny_unknown_fields)]
 pub struct SimWorkcellParameters {
-    /// Name of the problem: a file in `problems_dir`, without `.yaml`.
-    pub problem: String,
-    /// Seed of the episode.
-    pub seed: u64,
-    /// Directory of the problem files.
-    pub problems_dir: PathBuf,
+    /// What the emulated cell does, and how it is paced.
+    #[serde(flatten)]
+    pub emulator: EmulatorSettings,
     /// URDF of the work cell; empty for the one that was compiled in.
     pub urdf: PathBuf,
-    /// Frame of the work cell.
-    pub world_frame: String,
-    /// Whether to say where the links are and what they look like.
-    pub publish_robot: bool,
-    /// Action that follows a trajectory.
-    pub follow_action: String,
-    /// Action that follows a trajectory until the tool touches something.
-    pub until_action: String,
     /// Digital output that switches suction.
     pub suction_pin: u8,
     /// Digital input of the vacuum sensor.
     pub vacuum_pin: u8,
-    /// Simulated seconds per wall second; 0 for as fast as the host can.
-    pub real_time_factor: f64,
-    /// Joint states and clock messages per simulated second.
-    pub joint_states_rate_hz: f64,
-    /// Wall seconds between repeats of joint and pin states and clock while nothing moves; five times as many
-    /// when no command has come for a second.
-    pub status_period_s: f64,
-    /// Wall seconds between repeats of the camera frames while nothing moves.
-    pub frames_period_s: f64,
     /// What the cameras do: a file as those of config/perturbations; empty for perfect ones.
     pub perturbation: PathBuf,
-    /// How the driver behaves; an ideal one by default.
-    pub hardware: HardwareSettings,
-}
-
-impl SimWorkcellParameters {
-    /// Names of the motion actions.
-    pub(crate) fn actions(&self) -> ActionNames {
-        ActionNames {
-            follow: self.follow_action.clone(),
-            until: self.until_action.clone(),
-        }
-    }
 }
 
 impl Default for SimWorkcellParameters {
     fn default() -> Self {
         Self {
-            problem: "placing".into(),
-            seed: 10_000,
-            problems_dir: "config/problems".into(),
+            emulator: EmulatorSettings::default(),
             urdf: PathBuf::new(),
-            world_frame: "world".into(),
-            publish_robot: true,
-            follow_action: "scaled_joint_trajectory_controller/follow_joint_trajectory".into(),
-            until_action: "trajectory_until_node/execute".into(),
             suction_pin: 16,
             vacuum_pin: 16,
-            real_time_factor: 0.0,
-            joint_states_rate_hz: 50.0,
-            status_period_s: 0.02,
-            frames_period_s: 1.0,
             perturbation: PathBuf::new(),
-            hardware: HardwareSettings::default(),
         }
     }
 }

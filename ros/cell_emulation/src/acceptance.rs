@@ -3,13 +3,13 @@
 use std::sync::Arc;
 use std::time::Duration;
 
-use driver_model::{AcceptanceQueue, Answer, Fault, HardwareSettings};
+use driver_model::{AcceptanceQueue, Answer, HardwareSettings};
 use msgs::control_msgs::FollowJointTrajectory;
 use msgs::ur_msgs::FollowJointTrajectoryUntil;
 use node_kit::NewGoal;
 use ur5::WorkCell;
 
-use crate::goal::{Goal, Motion};
+use crate::goal::{End, Goal, Motion};
 use crate::server::{ActionNames, DriverState};
 use crate::trajectory::Failure;
 
@@ -57,9 +57,8 @@ impl Acceptance {
     pub fn follow(
         &self,
         goal: NewGoal<FollowJointTrajectory>,
-        fault: Fault,
     ) -> Option<(Goal, Result<Motion, Failure>)> {
-        if let Some(reason) = self.inactive(&self.controller, fault) {
+        if let Some(reason) = self.inactive(&self.controller) {
             goal.reject(reason);
             return None;
         }
@@ -78,12 +77,12 @@ impl Acceptance {
 
     /// The next goal of `trajectory_until_node` that is accepted now, no goal being active. Rejects on the way what the controllers do
     /// not take.
-    pub fn next(&mut self, now: Duration, fault: Fault) -> Option<(Goal, Result<Motion, Failure>)> {
+    pub fn next(&mut self, now: Duration) -> Option<(Goal, Result<Motion, Failure>)> {
         loop {
             let (Answer::Accept(goal) | Answer::Busy(goal)) = self.unanswered.pop(now, false)?;
             let inactive = self
-                .inactive(&self.controller, fault)
-                .or_else(|| self.inactive(TOOL_CONTACT, fault));
+                .inactive(&self.controller)
+                .or_else(|| self.inactive(TOOL_CONTACT));
             match inactive {
                 Some(reason) => goal.reject(reason),
                 None => {
@@ -108,14 +107,20 @@ impl Acceptance {
         }
     }
 
-    /// Why the goal under way ends: the controller that carries it out was deactivated.
-    pub fn lost_controller(&self) -> Option<String> {
-        let active = self.state.controllers().is_active(&self.controller);
-        (!active).then(|| format!("{} was deactivated", self.controller))
+    /// The end of the goal under way, where nobody has asked for it: its controller was deactivated, or the robot has stopped.
+    pub fn withdrawal(&self) -> Option<End> {
+        if !self.state.controllers().is_active(&self.controller) {
+            let reason = format!("{} was deactivated", self.controller);
+            return Some(End::withdrawn(&reason));
+        }
+        let fault = self.state.fault();
+        let reason = || format!("the robot has stopped: {fault:?}");
+        (!fault.lets_move()).then(|| End::withdrawn(&reason()))
     }
 
     /// Why a controller takes no goals.
-    fn inactive(&self, controller: &str, fault: Fault) -> Option<String> {
+    fn inactive(&self, controller: &str) -> Option<String> {
+        let fault = self.state.fault();
         if !fault.modes().program_running {
             return Some(format!("{controller} does not run: {fault:?}"));
         }
@@ -130,4 +135,35 @@ fn answer_range(hardware: &HardwareSettings) -> (Duration, Duration) {
         Duration::from_secs_f64(hardware.until_answer_min_s),
         Duration::from_secs_f64(hardware.until_answer_max_s),
     )
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use driver_model::Fault;
+
+    #[test]
+    fn a_goal_ends_where_its_controller_is_deactivated_or_the_robot_stops() {
+        let actions = ActionNames {
+            follow: "/arm/follow".into(),
+            until: "until".into(),
+        };
+        let mut hardware = HardwareSettings::default();
+        let state = Arc::new(DriverState::new(&actions, &hardware));
+        let work_cell = WorkCell::builtin().unwrap();
+        let acceptance =
+            Acceptance::new(Arc::clone(&state), &actions, &work_cell, &hardware, 10_000);
+        let reason = || match acceptance.withdrawal() {
+            None => String::new(),
+            Some(End::Withdrawn(failure)) => failure.reason,
+            Some(_) => panic!("not withdrawn"),
+        };
+        assert_eq!(reason(), "");
+        state.set_fault(Fault::ProtectiveStop);
+        assert_eq!(reason(), "the robot has stopped: ProtectiveStop");
+        state.set_fault(Fault::None);
+        hardware.inactive_controllers = vec!["arm".into()];
+        state.set_controllers(&actions, &hardware);
+        assert_eq!(reason(), "arm was deactivated");
+    }
 }

@@ -1,15 +1,20 @@
 //! A goal of one of the two motion actions, what it asks for, and how it ends.
 
+use std::time::Duration;
+
 use msgs::control_msgs::{
     FollowJointTrajectory, FollowJointTrajectoryFeedback, FollowJointTrajectoryResult,
 };
+use msgs::convert::{self, ConvertError};
 use msgs::std_msgs::Header;
 use msgs::trajectory_msgs::JointTrajectoryPoint;
 use msgs::ur_msgs::{
     FollowJointTrajectoryUntil, FollowJointTrajectoryUntilFeedback,
     FollowJointTrajectoryUntilResult,
 };
+use multiravens::MotionEnd;
 use node_kit::{NewGoal, RunningGoal};
+use simulated_cell::Step;
 use ur5::{JointTrajectory, Joints, WorkCell};
 
 use crate::trajectory::{Failure, follow_trajectory, path_tolerances, until_trajectory};
@@ -50,6 +55,23 @@ impl End {
     /// The driver ends a goal for this reason.
     pub fn withdrawn(reason: &str) -> Self {
         Self::Withdrawn(Failure::goal(reason))
+    }
+
+    /// How a step of the cell ends a goal; `None` where the arm is still on its way.
+    pub fn of_step(step: Step) -> Option<Self> {
+        let code = FollowJointTrajectoryResult::PATH_TOLERANCE_VIOLATED;
+        Some(match step {
+            Step::Moving => return None,
+            Step::Ended(MotionEnd::Reached) => Self::Reached,
+            Step::Ended(MotionEnd::Contact) => Self::Contact,
+            Step::Ended(MotionEnd::Lag) => {
+                let limit_m = multiravens::MAX_LAG_M;
+                let reason = format!("the suction tip was more than {limit_m} m behind the arm");
+                Self::Failed(Failure::new(code, reason))
+            }
+            Step::Deviated(deviation) => Self::Failed(Failure::new(code, deviation.to_string())),
+            Step::Failed(reason) => Self::Failed(Failure::goal(reason)),
+        })
     }
 }
 
@@ -94,8 +116,24 @@ impl Goal {
         }
     }
 
-    /// Says where the arm is, `time_from_start` after the motion began.
-    pub fn feedback(&self, header: Header, joint_names: Vec<String>, point: JointTrajectoryPoint) {
+    /// Says where the arm is and how fast it moves, `elapsed` after the motion began.
+    ///
+    /// # Errors
+    /// When that time is none of ROS.
+    pub fn feedback(
+        &self,
+        header: Header,
+        joint_names: &[String; 6],
+        [positions_rad, velocities_rad_s]: [&Joints; 2],
+        elapsed: Duration,
+    ) -> Result<(), ConvertError> {
+        let point = JointTrajectoryPoint {
+            positions: positions_rad.iter().copied().collect(),
+            velocities: velocities_rad_s.iter().copied().collect(),
+            time_from_start: convert::duration_to_msg(elapsed)?,
+            ..Default::default()
+        };
+        let joint_names = joint_names.to_vec();
         // The arm is where it should be.
         let error = JointTrajectoryPoint {
             positions: vec![0.0; point.positions.len()],
@@ -120,6 +158,7 @@ impl Goal {
                 error,
             }),
         }
+        Ok(())
     }
 
     /// Ends it, with the result that the driver's controllers send.
@@ -166,6 +205,30 @@ impl Goal {
                     _ => goal.succeed(result),
                 }
             }
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn a_step_ends_a_goal_with_the_code_of_its_reason() {
+        assert!(End::of_step(Step::Moving).is_none());
+        let reached = End::of_step(Step::Ended(MotionEnd::Reached));
+        assert!(matches!(reached, Some(End::Reached)));
+        let contact = End::of_step(Step::Ended(MotionEnd::Contact));
+        assert!(matches!(contact, Some(End::Contact)));
+        for (step, code, expected) in [
+            (Step::Ended(MotionEnd::Lag), -4, "more than 0.02 m behind"),
+            (Step::Failed("no motion".into()), -1, "no motion"),
+        ] {
+            let Some(End::Failed(failure)) = End::of_step(step) else {
+                panic!("expected a failure");
+            };
+            assert_eq!(failure.code, code);
+            assert!(failure.reason.contains(expected), "{failure}");
         }
     }
 }

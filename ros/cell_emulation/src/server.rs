@@ -3,7 +3,7 @@
 use std::convert::Infallible;
 use std::sync::{Arc, Mutex, MutexGuard, PoisonError};
 
-use driver_model::{CONTACT_SINCE, Controllers, HardwareSettings};
+use driver_model::{CONTACT_SINCE, Controllers, Fault, HardwareSettings};
 use msgs::control_msgs::FollowJointTrajectory;
 use msgs::controller_manager_msgs::{
     ControllerState, ListControllers, ListControllersResponse, SwitchController,
@@ -16,6 +16,8 @@ use msgs::ur_msgs::{
 use node_kit::{ActionServer, NewGoal, Node, NodeError, ServiceServer};
 use tokio::sync::{oneshot, watch};
 use tracing::error;
+
+use crate::health::{FaultChange, Health};
 
 /// Names of the two motion actions.
 #[derive(Clone, Debug)]
@@ -51,6 +53,7 @@ pub struct DriverState {
     /// Whether the driver's process is gone.
     dead: watch::Sender<bool>,
     controllers: Mutex<Controllers>,
+    health: Mutex<Health>,
 }
 
 impl DriverState {
@@ -64,6 +67,7 @@ impl DriverState {
         Self {
             dead: watch::channel(false).0,
             controllers: Mutex::new(controllers),
+            health: Mutex::default(),
         }
     }
 
@@ -76,12 +80,32 @@ impl DriverState {
         );
     }
 
-    /// A dead driver answers nothing, and does not know of what was asked meanwhile when it is started again.
-    pub fn set_dead(&self, dead: bool) {
-        self.dead.send_replace(dead);
+    /// Sets what is wrong with the robot. A dead driver answers nothing, and does not know of what was asked meanwhile when it is started
+    /// again.
+    pub fn set_fault(&self, fault: Fault) -> FaultChange {
+        self.change_health(|health| health.set_fault(fault))
     }
 
-    fn is_dead(&self) -> bool {
+    /// The driver's process is gone, whatever is set later.
+    pub fn end(&self) {
+        self.change_health(Health::end);
+    }
+
+    fn change_health<T>(&self, change: impl FnOnce(&mut Health) -> T) -> T {
+        let mut health = self.health.lock().unwrap_or_else(PoisonError::into_inner);
+        let changed = change(&mut health);
+        self.dead.send_replace(health.is_dead());
+        changed
+    }
+
+    /// What is wrong with the robot.
+    pub fn fault(&self) -> Fault {
+        let health = self.health.lock().unwrap_or_else(PoisonError::into_inner);
+        health.fault()
+    }
+
+    /// Whether the driver's process is gone: the robot stops by itself, and nobody hears of it.
+    pub fn is_dead(&self) -> bool {
         *self.dead.borrow()
     }
 

@@ -28,6 +28,7 @@ use crate::{
     diagnostics::{self, Diagnostics, Level},
     endpoint::{Conflict, Direction, Endpoint},
     graph::{Graph, NodeNames},
+    idempotent::{IdempotentServer, IdempotentService},
     invalid_parameter::InvalidParameter,
     logging,
     parameter_store::ParameterStore,
@@ -35,6 +36,7 @@ use crate::{
     qos::{Qos, QosOverride},
     qos_overrides::QosOverrides,
     raw::{self, RawPublisher, RawQos, RawSubscription},
+    reply_cache::ReplyCache,
     service::{ServiceClient, ServiceServer},
     statistics::Statistics,
     task_group::TaskGroup,
@@ -506,6 +508,16 @@ impl Node {
             service,
             self.statistics(Statistics::new(&full, Direction::In)),
         )
+    }
+
+    /// Answers a service that carries each request out once; `replies` outlives the server, so that it holds over a deactivation.
+    pub fn idempotent_server<S: IdempotentService + 'static>(
+        &self,
+        service: &str,
+        replies: &ReplyCache<S::Response>,
+    ) -> Result<IdempotentServer<S>, NodeError> {
+        let server = self.service_server(service)?;
+        Ok(IdempotentServer::new(server, replies))
     }
 
     /// A service that every node has; `/diagnostics` names it only after errors.

@@ -328,11 +328,8 @@ impl Collected {
         let use_sim_time = self.of_every_node("use_sim_time", false)?;
         let autostart = self.of_every_node("autostart", true)?;
         let qos_overrides = self.qos_overrides()?;
-        let tree = Value::Mapping(std::mem::take(&mut self.tree));
-        let parameters: P = serde_path_to_error::deserialize(tree).map_err(|error| {
-            let path = error.path().to_string();
-            self.error(&path, error.inner().to_string())
-        })?;
+        let parameters: P =
+            read(&self.tree).map_err(|invalid| self.error(&invalid.name, invalid.reason))?;
         parameters
             .check()
             .map_err(|invalid| self.error(&invalid.name, invalid.reason))?;
@@ -446,12 +443,31 @@ pub(crate) fn from_values<'a, P: Parameters>(
     for (name, value) in values {
         collected.set(name, value.clone(), "");
     }
-    let parameters: P =
-        serde_path_to_error::deserialize(Value::Mapping(collected.tree)).map_err(|error| {
-            InvalidParameter::new(error.path().to_string(), error.inner().to_string())
-        })?;
+    let parameters: P = read(&collected.tree)?;
     parameters.check()?;
     Ok(parameters)
+}
+
+/// The parameters of a tree of values.
+fn read<P: Parameters>(tree: &Mapping) -> Result<P, InvalidParameter> {
+    serde_path_to_error::deserialize(Value::Mapping(tree.clone())).map_err(|error| {
+        let path = error.path().to_string();
+        // serde loses the way to a parameter that stands in a struct with `#[serde(flatten)]`.
+        let lost = || unreadable::<P>(tree).filter(|_| path == ".");
+        InvalidParameter::new(lost().unwrap_or(path), error.inner().to_string())
+    })
+}
+
+/// The first parameter of a tree that cannot be read alone either.
+fn unreadable<P: Parameters>(tree: &Mapping) -> Option<String> {
+    let mut values = Vec::new();
+    flatten("", Value::Mapping(tree.clone()), &mut values);
+    let found = values.into_iter().find(|(name, value)| {
+        let mut alone = Collected::default();
+        alone.set(name, value.clone(), "");
+        serde_yaml_ng::from_value::<P>(Value::Mapping(alone.tree)).is_err()
+    });
+    found.map(|(name, _)| name)
 }
 
 /// The description of each parameter in a parameter file: the comment above it, or above the line

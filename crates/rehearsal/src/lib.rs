@@ -1,9 +1,12 @@
 #![doc = include_str!("../README.md")]
 
+mod carry_out;
 mod planned;
+mod rehearsals;
 mod robot_now;
 mod surface;
 
 pub use planned::PlannedPrimitive;
+pub use rehearsals::{Reading, RehearsalRules, Rehearsals};
 pub use robot_now::{HOME_SETTINGS, Picked, Rehearsed, RobotNow, Subject};
 pub use surface::touchdown;

@@ -1,8 +1,32 @@
 //! Causes and stops of motions, and the reported results.
 
+use std::time::Duration;
+
 use pick_place::{Outcome, Phase};
 
-use crate::{ProposalId, StepOutcome};
+use crate::{Proposal, ProposalId, StepOutcome};
+
+/// A motion that may begin.
+#[derive(Clone, Debug, PartialEq)]
+pub enum MotionOrder {
+    /// Carry out this proposal.
+    Proposal(Box<Proposal>),
+    /// Bring the arm home, straight up first; suction stays as it is.
+    Home(ProposalId),
+    /// Put down what is held where it was picked, and bring the arm home.
+    PutDown(ProposalId),
+}
+
+impl MotionOrder {
+    /// What moves the arm then.
+    pub fn cause(&self) -> MotionCause {
+        match self {
+            Self::Proposal(proposal) => MotionCause::Proposal(proposal.id),
+            Self::Home(id) => MotionCause::Home(*id),
+            Self::PutDown(id) => MotionCause::PutDown(*id),
+        }
+    }
+}
 
 /// What moves the arm.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -20,6 +44,15 @@ impl MotionCause {
     pub fn id(self) -> ProposalId {
         match self {
             Self::Proposal(id) | Self::Home(id) | Self::PutDown(id) => id,
+        }
+    }
+
+    /// The motion, for people.
+    pub fn name(self) -> String {
+        match self {
+            Self::Proposal(id) => format!("the motion of proposal {id}"),
+            Self::Home(_) => "the way home".to_owned(),
+            Self::PutDown(_) => "putting down what is held".to_owned(),
         }
     }
 
@@ -69,6 +102,26 @@ impl StopCause {
             Self::Disabled => "stopped because the enabling input was low (driver.enable_pin)",
             Self::Deactivated => "stopped because the executor was deactivated",
             Self::Shutdown => "stopped because the executor was told to end",
+        }
+    }
+}
+
+/// When a motion ended and how long it took, in ROS time. Heightmaps from `until` on show its result.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct MotionTimes {
+    /// Its end.
+    pub until: Duration,
+    /// From its first to its last joint reading.
+    pub duration: Duration,
+}
+
+impl MotionTimes {
+    /// `stamps`: of the first and the last joint reading; of a motion without one nothing is known. `now`: simulated time may still be on its way.
+    pub fn new(stamps: Option<(Duration, Duration)>, now: Duration) -> Self {
+        let (first, last) = stamps.unwrap_or((now, now));
+        Self {
+            until: last.max(now),
+            duration: last.saturating_sub(first),
         }
     }
 }
@@ -175,6 +228,19 @@ mod tests {
         let failed = MotionEnd::Failed("lost".into()).word(cause, None);
         assert_eq!(failed.outcome, StepOutcome::Fault);
         assert_eq!(failed.broken_off.as_deref(), Some("lost"));
+    }
+
+    #[test]
+    fn a_motion_ends_with_its_last_joint_reading_or_now() {
+        let second = Duration::from_secs;
+        let times = |stamps, now| {
+            let times = MotionTimes::new(stamps, second(now));
+            (times.until.as_secs(), times.duration.as_secs())
+        };
+        assert_eq!(times(Some((second(2), second(5))), 4), (5, 3));
+        assert_eq!(times(Some((second(2), second(5))), 9), (9, 3));
+        assert_eq!(times(Some((second(5), second(2))), 9), (9, 0));
+        assert_eq!(times(None, 9), (9, 0));
     }
 
     #[test]

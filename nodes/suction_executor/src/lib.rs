@@ -1,12 +1,11 @@
 //! Node that executes approved proposals through the UR driver interface.
 //!
-//! [`step_protocol::ApprovalGate`] decides what may move, without middleware; the rest moves it through the driver's own
-//! topics, service and actions, and reports.
+//! [`step_protocol::Executor`] decides, without middleware: it holds the gate that says what may move. [`rehearsal`] checks motions before they are
+//! approved, [`ur_driver`] moves the arm. The node converts, calls and publishes.
 
 mod cell;
 mod node;
 mod parameters;
-mod stop_memory;
 
 pub use node::{ExecutorNode, configure};
 pub use parameters::{JointLimits, Limits, SuctionExecutorParameters};

@@ -1,11 +1,16 @@
 //! Parameters; `config/suction_executor.yaml` explains each.
 
 use std::path::PathBuf;
+use std::sync::Arc;
+use std::time::Duration;
 
+use collision::CollisionChecker;
+use heightmap::ChangeRules;
 use node_kit::{Parameters, Range};
 use pick_place::{ContactSettings, PrimitiveSettings};
+use rehearsal::RehearsalRules;
 use serde::{Deserialize, Serialize};
-use step_protocol::RequireApproval;
+use step_protocol::{GateRules, RequireApproval};
 use ur_driver::DriverParameters;
 use ur5::Arm;
 
@@ -141,7 +146,7 @@ impl Default for JointLimits {
 }
 
 impl Limits {
-    pub(crate) fn settings(&self) -> PrimitiveSettings {
+    fn settings(&self) -> PrimitiveSettings {
         PrimitiveSettings {
             clearance_m: self.clearance_m,
             lift_m: self.lift_m,
@@ -159,7 +164,39 @@ const TIME: Range = Range::Float(0.001, 3600.0);
 const PIN: Range = Range::Integer(0, 17);
 
 impl SuctionExecutorParameters {
-    pub(crate) fn require_approval(&self) -> RequireApproval {
+    /// What the gate goes by.
+    pub(crate) fn gate_rules(&self) -> GateRules {
+        GateRules {
+            frame: self.world_frame.clone(),
+            limits: self.limits.settings(),
+            changes: self.changes(),
+            confirmation_grace: Duration::from_secs_f64(self.confirmation_grace_s),
+            require_approval: self.require_approval(),
+            operators: self.operators.clone(),
+        }
+    }
+
+    /// What rehearsals go by.
+    pub(crate) fn rehearsal_rules(&self, arm: Arm, checker: CollisionChecker) -> RehearsalRules {
+        RehearsalRules {
+            arm,
+            checker: Arc::new(checker),
+            needs_home: self.observation_needs_home,
+            observation_max_age: Duration::from_secs_f64(self.observation_max_age_s),
+            contact: self.contact,
+            sign: self.driver.contact,
+            changes: self.changes(),
+        }
+    }
+
+    fn changes(&self) -> ChangeRules {
+        ChangeRules::new(
+            self.observation_tolerance_m,
+            1e-6 * self.observation_changed_area_mm2,
+        )
+    }
+
+    fn require_approval(&self) -> RequireApproval {
         match self.require_approval {
             Approval::Always => RequireApproval::Always,
             Approval::Unsure => RequireApproval::Unsure {

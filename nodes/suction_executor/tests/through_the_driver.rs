@@ -7,10 +7,10 @@ use std::time::{Duration, Instant};
 
 use heightmap::{Camera, Fusion, Heightmap, View, Workspace};
 use msgs::convert;
-use msgs::diagnostic_msgs::DiagnosticArray;
+use msgs::diagnostic_msgs::{DiagnosticArray, DiagnosticStatus};
 use msgs::sctn_msgs::{
-    self, OperatorPresence, PlannedMotion, ProposeHome, ProposeHomeRequest, Reward,
-    StepConfirmation, StepResult,
+    self, OperatorPresence, PlannedMotion, ProposeHome, ProposeHomeRequest, ProposeHomeResponse,
+    Reward, StepConfirmation, StepResult,
 };
 use msgs::sensor_msgs::{CameraInfo, Image, JointState};
 use msgs::tf2_msgs::TFMessage;
@@ -22,6 +22,7 @@ use node_kit::{
     RosArguments, State, Subscription, Transition,
 };
 use pick_place::{PickPlace, PrimitiveSettings};
+use tokio::task::JoinHandle;
 use ur5::WorkCell;
 
 const SEED: u64 = 10_000;
@@ -50,6 +51,8 @@ async fn within<T>(what: &str, future: impl Future<Output = T>) -> T {
 struct Bench {
     sim: Context,
     executor: Context,
+    /// Ends when the executor has ended.
+    executor_life: Option<JoinHandle<anyhow::Result<()>>>,
     node: Node,
     heightmaps: Publisher<sctn_msgs::Heightmap>,
     proposals: Publisher<sctn_msgs::PickPlace>,
@@ -84,7 +87,7 @@ impl Bench {
                 .map(|(camera, topic)| (camera, node.subscription(&topic, Qos::Image).unwrap()))
                 .collect()
         };
-        let bench = Self {
+        let mut bench = Self {
             heightmaps: node.publisher("heightmap", Qos::Latched).unwrap(),
             proposals: node.publisher("pick_place", Qos::Latched).unwrap(),
             confirmations: node.publisher("step_confirmation", Qos::Event).unwrap(),
@@ -105,6 +108,7 @@ impl Bench {
                 .collect(),
             sim: Context::new(network),
             executor: Context::new(network),
+            executor_life: None,
             node,
         };
         let common = |more: &[(&'static str, String)], given: &[(&str, String)]| {
@@ -129,7 +133,7 @@ impl Bench {
                 sim_workcell::configure,
             )
             .unwrap();
-        bench
+        let life = bench
             .executor
             .start(
                 "suction_executor",
@@ -137,6 +141,7 @@ impl Bench {
                 suction_executor::configure,
             )
             .unwrap();
+        bench.executor_life = Some(life);
         let graph = bench.node.graph();
         for topic in [
             bench.proposals.topic(),
@@ -149,8 +154,15 @@ impl Bench {
             );
         }
         assert!(graph.wait_for_publisher("/step_result", PATIENCE).await);
-        // Both ends have to have seen each other.
-        tokio::time::sleep(Duration::from_secs(2)).await;
+        // Discovery tells of endpoints in the order in which they were made: who answers a client that was made last knows all those above.
+        for name in ["/sim_workcell", "/suction_executor"] {
+            let life = LifecycleClient::new(&bench.node, name).unwrap();
+            life.wait(PATIENCE).await.unwrap();
+            let is_active = async || matches!(life.state().await, Ok(Some(State::Active)));
+            within("active node", async { while !is_active().await {} }).await;
+        }
+        let ready = |status: &DiagnosticStatus| status.message == "ready";
+        bench.diagnosed("/suction_executor: driver", ready).await;
         bench
     }
 
@@ -305,6 +317,80 @@ impl Bench {
         }
     }
 
+    /// A state in the diagnostics that is as a test needs it.
+    async fn diagnosed(&mut self, name: &str, accept: impl Fn(&DiagnosticStatus) -> bool) {
+        let found = async {
+            loop {
+                let array = self.diagnostics.recv().await;
+                let mut statuses = array.status.iter();
+                if statuses.any(|status| status.name == name && accept(status)) {
+                    return;
+                }
+            }
+        };
+        within(name, found).await;
+    }
+
+    /// Waits until the executor has read so many messages of a topic.
+    async fn read_by_executor(&mut self, topic: &str, messages: u64) {
+        let text = format!("in messages={messages} ");
+        let has_read = |status: &DiagnosticStatus| {
+            let mut values = status.values.iter();
+            values.any(|value| value.key == topic && value.value.starts_with(&text))
+        };
+        self.diagnosed("/suction_executor: topics", has_read).await;
+    }
+
+    /// The arm stands where it stood, and nothing has moved since: simulated time has not gone on either.
+    async fn stands_since(&mut self, stood: &JointState) {
+        assert_eq!(self.joints().await, *stood);
+    }
+
+    /// Waits until the arm leaves where it stands. It does so at once in simulated time: nothing has moved before.
+    async fn leaves(&mut self, stood: &JointState) {
+        let left = within("motion", async {
+            loop {
+                let state = self.joint_states.recv().await;
+                if state.position != stood.position {
+                    return state;
+                }
+            }
+        });
+        let passed = time_of(&left.await) - time_of(stood);
+        assert!(passed < Duration::from_millis(100), "{passed:?}");
+    }
+
+    /// Proposes the way home once the executor is ready for it.
+    async fn propose_home(&mut self) -> ProposeHomeResponse {
+        let client = self
+            .node
+            .service_client::<ProposeHome>("/suction_executor/propose_home")
+            .unwrap();
+        client.wait_for_server(PATIENCE).await.unwrap();
+        // A call may be lost while the two ends are still discovering each other.
+        let patient = CallOptions {
+            attempts: 12,
+            timeout: PATIENCE / 12,
+        };
+        let call = ProposeHomeRequest::default();
+        client.call(&call, &patient).await.unwrap()
+    }
+
+    /// Brings the arm home by a way home that was proposed. Nothing else has moved since it stood still.
+    async fn goes_home_since(&mut self, stood: &JointState, proposal_id: u64) {
+        self.decide(proposal_id, StepConfirmation::APPROVE);
+        let result = self.ended(proposal_id, StepResult::AT_HOME).await;
+        let end = convert::time_from_msg(&result.header.stamp).unwrap();
+        let took = convert::duration_from_msg(&result.duration).unwrap();
+        assert_eq!(end - time_of(stood), took);
+    }
+
+    /// Waits until simulated time has gone on by so much.
+    async fn until_passed(&mut self, time: Duration) {
+        let begin = time_of(&self.next_joints().await);
+        while time_of(&self.next_joints().await) < begin + time {}
+    }
+
     /// Waits until the arm has left where it was.
     async fn until_moving(&mut self) {
         while self.joint_states.try_recv().is_some() {}
@@ -323,6 +409,10 @@ async fn newest<M: msgs::Interface>(
             return message;
         }
     }
+}
+
+fn time_of(state: &JointState) -> Duration {
+    convert::time_from_msg(&state.header.stamp).unwrap()
 }
 
 fn reference() -> Environment {
@@ -445,33 +535,19 @@ async fn a_stop_stops_the_arm_and_it_goes_on_neither_by_itself_nor_on_the_old_ap
         "{}",
         result.reason
     );
-    tokio::time::sleep(Duration::from_secs(1)).await;
-    assert_eq!(bench.joints().await.position, stopped.position);
     // Called home, it can see and be told again. The call alone moves nothing.
-    let home_service = bench
-        .node
-        .service_client::<ProposeHome>("/suction_executor/propose_home")
-        .unwrap();
-    home_service.wait_for_server(PATIENCE).await.unwrap();
-    // A call may be lost while the two ends are still discovering each other.
-    let patient = CallOptions {
-        attempts: 12,
-        timeout: PATIENCE / 12,
-    };
-    let call = ProposeHomeRequest::default();
-    let proposed = home_service.call(&call, &patient).await.unwrap();
+    let proposed = bench.propose_home().await;
     assert!(
         proposed.success && proposed.needs_approval,
         "{}",
         proposed.message
     );
-    let again = home_service.call(&call, &patient).await.unwrap();
+    let again = bench.propose_home().await;
     assert_eq!(again.proposal_id, proposed.proposal_id);
     bench.decide(1, StepConfirmation::APPROVE);
     bench.ended(1, StepResult::REFUSED).await;
-    assert_eq!(bench.joints().await.position, stopped.position);
-    bench.decide(proposed.proposal_id, StepConfirmation::APPROVE);
-    bench.ended(proposed.proposal_id, StepResult::AT_HOME).await;
+    bench.stands_since(&stopped).await;
+    bench.goes_home_since(&stopped, proposed.proposal_id).await;
     let at_home = bench.joints().await;
     assert_eq!(
         convert::joints_from_msg(&at_home, &environment.cell().work_cell().joint_names).unwrap(),
@@ -507,8 +583,6 @@ async fn deactivating_during_a_motion_stops_the_arm_and_nothing_moves_until_a_ne
     let stopped = bench.joints().await;
     // Nobody hears this.
     bench.decide(1, StepConfirmation::APPROVE);
-    tokio::time::sleep(Duration::from_secs(1)).await;
-    assert_eq!(bench.joints().await.position, stopped.position);
     executor
         .lead(
             Transition::Activate,
@@ -525,16 +599,37 @@ async fn deactivating_during_a_motion_stops_the_arm_and_nothing_moves_until_a_ne
             .wait_for_subscription(bench.confirmations.topic(), PATIENCE)
             .await
     );
-    tokio::time::sleep(Duration::from_secs(1)).await;
+    // Both ends may still be discovering each other. Had the executor heard the approval before, it would answer that first.
+    let unknown = async {
+        loop {
+            bench.decide(50, StepConfirmation::APPROVE);
+            let answer = tokio::time::timeout(Duration::from_secs(2), bench.results.recv());
+            if let Ok(result) = answer.await {
+                return result;
+            }
+        }
+    };
+    let result = within("answer", unknown).await;
+    assert_eq!(result.proposal_id, 50, "{}", result.reason);
     bench.decide(1, StepConfirmation::APPROVE);
-    let result = bench.result().await;
-    assert_eq!(result.outcome, StepResult::REFUSED, "{}", result.reason);
+    // That of the unknown one may have been heard more than once.
+    let known = newest(&mut bench.results, |result| result.proposal_id != 50);
+    let result = within("step_result", known).await;
+    assert_eq!(
+        (result.proposal_id, result.outcome),
+        (1, StepResult::REFUSED),
+        "{}",
+        result.reason
+    );
     assert!(
         result.reason.contains("already carried out"),
         "{}",
         result.reason
     );
-    assert_eq!(bench.joints().await.position, stopped.position);
+    bench.stands_since(&stopped).await;
+    let home = bench.propose_home().await;
+    assert!(home.success, "{}", home.message);
+    bench.goes_home_since(&stopped, home.proposal_id).await;
     bench.stop().await;
 }
 
@@ -546,8 +641,10 @@ async fn an_executor_that_is_told_to_end_during_a_motion_stops_the_arm_first() {
     bench.executor.shutdown();
     bench.ended(1, StepResult::STOPPED).await;
     let stopped = bench.joints().await;
-    tokio::time::sleep(Duration::from_secs(1)).await;
-    assert_eq!(bench.joints().await.position, stopped.position);
+    let life = bench.executor_life.take().unwrap();
+    let ended = within("end of the executor", life).await;
+    ended.unwrap().unwrap();
+    bench.stands_since(&stopped).await;
     bench.stop().await;
 }
 
@@ -582,15 +679,21 @@ async fn a_protective_stop_is_a_fault_and_nothing_moves_until_it_is_over() {
         "{}",
         result.reason
     );
-    assert_eq!(bench.joints().await.position, stopped.position);
-    // ... and when it is over the arm waits for a word.
+    bench.stands_since(&stopped).await;
+    // ... and when it is over, which the executor knows when it proposes the way home, the arm waits for a word.
     bench.safety_mode.publish(SafetyMode {
         mode: SafetyMode::NORMAL,
     });
-    tokio::time::sleep(Duration::from_secs(1)).await;
-    assert_eq!(bench.joints().await.position, stopped.position);
+    loop {
+        let home = bench.propose_home().await;
+        if home.success {
+            break;
+        }
+        assert!(home.message.contains("PROTECTIVE_STOP"), "{}", home.message);
+    }
+    bench.stands_since(&stopped).await;
     bench.decide(2, StepConfirmation::APPROVE);
-    bench.until_moving().await;
+    bench.leaves(&stopped).await;
     bench.stop().await;
 }
 
@@ -610,6 +713,10 @@ async fn a_lost_driver_is_a_fault() {
 async fn when_no_approval_is_required_a_proposal_moves_once_by_itself_until_a_stop() {
     let automatic = vec![("require_approval", "never".to_owned())];
     let (mut bench, mut environment, _) = proposed(&[], &automatic).await;
+    let mut planned = bench
+        .node
+        .subscription::<PlannedMotion>("planned_motion", Qos::Latched)
+        .unwrap();
     let action = reference().demonstrate().unwrap();
     let (time, settings) = (environment.cell().time(), environment.settings().unwrap());
     let expected = environment.step(&action).unwrap();
@@ -619,29 +726,33 @@ async fn when_no_approval_is_required_a_proposal_moves_once_by_itself_until_a_st
         expected.time
     );
     // The same message once more moves nothing.
-    let before = bench.joints().await.position;
+    let before = bench.joints().await;
     bench.propose(1, time, &action, &settings);
-    tokio::time::sleep(Duration::from_secs(1)).await;
-    assert_eq!(bench.joints().await.position, before);
-    // Nor does anything by itself after a stop.
+    bench.read_by_executor("/pick_place", 2).await;
+    bench.stands_since(&before).await;
+    // Nor does anything by itself after a stop; confirmations are read one after the other.
     bench.decide(1, StepConfirmation::STOP);
-    tokio::time::sleep(Duration::from_secs(1)).await;
+    bench.decide(1, StepConfirmation::APPROVE);
+    bench.ended(1, StepResult::REFUSED).await;
     let seen = bench.look(expected.time).await;
     bench.observe(&seen, expected.time);
-    bench.propose(
-        2,
-        expected.time,
-        &environment.demonstrate().unwrap(),
-        &environment.settings().unwrap(),
-    );
-    tokio::time::sleep(Duration::from_secs(2)).await;
-    assert_eq!(bench.joints().await.position, before);
+    let action = environment.demonstrate().unwrap();
+    let settings = environment.settings().unwrap();
+    bench.propose(2, expected.time, &action, &settings);
+    // Once it was rehearsed it could move.
+    let of_second = newest(&mut planned, |m| m.proposal_id == 2);
+    within("planned motion", of_second).await;
     // An approval that is refused changes nothing about that, one that holds lets it go on.
     bench.decide(99, StepConfirmation::APPROVE);
     bench.ended(99, StepResult::REFUSED).await;
-    assert_eq!(bench.joints().await.position, before);
+    bench.stands_since(&before).await;
     bench.decide(2, StepConfirmation::APPROVE);
-    bench.ended(2, StepResult::PLACED).await;
+    let result = bench.ended(2, StepResult::PLACED).await;
+    // Nothing else has moved: simulated time would have gone on.
+    assert_eq!(
+        convert::time_from_msg(&result.header.stamp).unwrap(),
+        environment.step(&action).unwrap().time
+    );
     bench.stop().await;
 }
 
@@ -673,21 +784,27 @@ async fn with_require_presence_nothing_moves_unattended_and_a_motion_stops_when_
             ..OperatorPresence::default()
         });
     };
-    // The operator is there until the arm moves, and then nothing more is heard.
-    for _ in 0..5 {
+    // The operator is there until the arm moves, and then nothing more is heard. The executor may hear of the approval first.
+    let at_home = bench.joints().await.position;
+    let mut beat = tokio::time::interval(Duration::from_millis(200));
+    let moving = async {
         present();
-        tokio::time::sleep(Duration::from_millis(200)).await;
-    }
-    bench.decide(1, StepConfirmation::APPROVE);
-    {
-        let mut moving = std::pin::pin!(bench.until_moving());
+        bench.decide(1, StepConfirmation::APPROVE);
         loop {
             tokio::select! {
-                () = &mut moving => break,
-                () = tokio::time::sleep(Duration::from_millis(200)) => present(),
+                state = bench.joint_states.recv() => if state.position != at_home {
+                    return;
+                },
+                result = bench.results.recv() => {
+                    assert!(result.reason.contains("no operator is present"), "{}", result.reason);
+                    present();
+                    bench.decide(1, StepConfirmation::APPROVE);
+                }
+                _ = beat.tick() => present(),
             }
         }
-    }
+    };
+    within("motion", moving).await;
     let result = bench.ended(1, StepResult::STOPPED).await;
     assert_eq!(result.proposal_id, 1);
     let stopped = bench.joints().await;
@@ -781,22 +898,10 @@ async fn every_planned_motion_keeps_to_the_limits_of_the_joints_and_so_does_the_
         .await;
         bench.decide(1, StepConfirmation::APPROVE);
         bench.until_moving().await;
-        tokio::time::sleep(Duration::from_secs(1)).await;
+        bench.until_passed(Duration::from_secs(1)).await;
         bench.decide(1, StepConfirmation::STOP);
         bench.ended(1, StepResult::STOPPED).await;
-        let client = bench
-            .node
-            .service_client::<ProposeHome>("/suction_executor/propose_home")
-            .unwrap();
-        client.wait_for_server(PATIENCE).await.unwrap();
-        let patient = CallOptions {
-            attempts: 12,
-            timeout: PATIENCE / 12,
-        };
-        let home = client
-            .call(&ProposeHomeRequest::default(), &patient)
-            .await
-            .unwrap();
+        let home = bench.propose_home().await;
         assert!(home.success, "{}", home.message);
         let of_home = newest(&mut planned, |m| m.proposal_id == home.proposal_id);
         let of_home = within("planned way home", of_home).await;

@@ -8,7 +8,9 @@ mod parameters;
 pub mod planted;
 mod readiness;
 mod robot;
+mod running_motion;
 pub mod status;
+mod stop_file;
 mod streams;
 #[cfg(test)]
 mod tests;
@@ -34,6 +36,8 @@ pub use self::heartbeat::Heartbeat;
 pub use self::parameters::DriverParameters;
 pub use self::readiness::driver_obstacle;
 pub use self::robot::DriverRobot;
+pub use self::running_motion::{MotionEvent, RunningMotion};
+pub use self::stop_file::StopFile;
 
 /// Why the robot does not go on. Suction stays as it is: holding is safer than dropping.
 #[derive(Clone, Debug, PartialEq, Eq, thiserror::Error)]
@@ -119,7 +123,7 @@ impl DriverClient {
     }
 
     /// What the driver was found to lack.
-    pub fn refusal(&self) -> Option<String> {
+    fn refusal(&self) -> Option<String> {
         match &*self.readiness.borrow() {
             Readiness::Refused(reason) => Some(reason.clone()),
             Readiness::Ready | Readiness::Unchecked(_) => None,
@@ -139,7 +143,12 @@ impl DriverClient {
             .obstacle(self.origin.elapsed(), max_age)
     }
 
-    /// The same, and what the driver was found to lack, or that it is not known yet.
+    /// Why nothing may begin to move, as far as is known. Where the driver's checks are still under way, a motion waits for them.
+    pub fn obstacle_to_begin(&self) -> Option<String> {
+        self.obstacle().or_else(|| self.refusal())
+    }
+
+    /// The same, and that it is not known yet what the driver lacks.
     pub fn unready(&self) -> Option<String> {
         self.obstacle()
             .or_else(|| self.readiness.borrow().obstacle())

@@ -16,7 +16,7 @@ use crate::{
 pub(super) const NOW: Duration = Duration::from_secs(100);
 const GRACE: Duration = Duration::from_secs(1);
 
-fn rules() -> GateRules {
+pub(super) fn rules() -> GateRules {
     GateRules {
         frame: "world".into(),
         limits: PrimitiveSettings {
@@ -67,12 +67,12 @@ pub(super) fn proposal(id: u64) -> Proposal {
 /// A robot that can do everything, or says why not.
 #[derive(Default)]
 pub(super) struct Robot {
-    obstacle: Option<&'static str>,
-    no_plan: Option<&'static str>,
+    pub(super) obstacle: Option<&'static str>,
+    pub(super) no_plan: Option<&'static str>,
     /// Whether motions are still to be rehearsed.
-    unrehearsed: bool,
+    pub(super) unrehearsed: bool,
     /// Where every joint is (rad).
-    joints_rad: f64,
+    pub(super) joints_rad: f64,
 }
 
 impl RobotState for Robot {
@@ -109,7 +109,7 @@ const UNREHEARSED: Robot = Robot {
     ..READY
 };
 
-fn empty() -> Arc<Heightmap> {
+pub(super) fn empty() -> Arc<Heightmap> {
     raised(0)
 }
 

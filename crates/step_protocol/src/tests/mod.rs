@@ -1,4 +1,5 @@
 mod diagram;
+mod executor;
 mod gate;
 mod operator;
 mod planner;

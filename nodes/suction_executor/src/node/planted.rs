@@ -1,14 +1,14 @@
 //! Where planted faults act.
 
-use std::sync::Arc;
-
 use pick_place::Robot as _;
-use step_protocol::{OperatorDecision, Proposal, ProposalId, ProposalStatus, StepOutcome};
-use tokio_util::sync::CancellationToken;
-use ur_driver::DriverRobot;
+use step_protocol::{
+    ExecutorAction, MotionOrder, OperatorDecision, Proposal, ProposalId, ProposalStatus,
+    StepOutcome,
+};
+use ur_driver::RunningMotion;
 use ur_driver::planted::{Planted, is_planted};
 
-use super::Executor;
+use super::ActiveNode;
 
 /// What planted faults remember.
 #[derive(Debug, Default)]
@@ -17,16 +17,16 @@ pub(super) struct Memory {
     begins_again: Option<Proposal>,
 }
 
-impl Executor<'_> {
+impl ActiveNode<'_> {
     /// A proposal has arrived that can be approved.
     pub(super) fn plant_at_proposal(&mut self) {
-        let Some(proposal) = self.gate.pending().cloned() else {
+        let Some(proposal) = self.configured.protocol.pending().cloned() else {
             return;
         };
         let id = proposal.id;
         self.planted.proposals.push(proposal);
         if is_planted(Planted::MovesUnapproved) {
-            self.confirm(id, OperatorDecision::Approve);
+            self.confirm(id, OperatorDecision::Approve, self.first_operator());
         }
     }
 
@@ -41,20 +41,20 @@ impl Executor<'_> {
         match decision {
             OperatorDecision::Approve if is_planted(Planted::AnyApproval) && !is_newest => {
                 if let Some(newest) = newest {
-                    self.confirm(newest, decision);
+                    self.confirm(newest, decision, self.first_operator());
                 }
                 true
             }
             OperatorDecision::Approve
                 if self.motion.is_none()
-                    && self.gate.status(id) != Some(ProposalStatus::Pending)
+                    && self.configured.protocol.status(id) != Some(ProposalStatus::Pending)
                     && (is_planted(Planted::ApprovesTwice) && is_newest
                         || is_planted(Planted::ApprovesSuperseded) && !is_newest) =>
             {
                 let mut known = self.planted.proposals.iter();
                 match known.find(|known| known.id == id).cloned() {
                     Some(proposal) => {
-                        self.begin(proposal);
+                        self.begin_again(proposal);
                         true
                     }
                     None => false,
@@ -67,20 +67,23 @@ impl Executor<'_> {
     }
 
     /// A motion has ended.
-    pub(super) fn plant_at_end(&mut self, outcome: StepOutcome) {
+    pub(super) fn plant_at_end(&mut self, outcome: Option<StepOutcome>) {
         let newest = self.planted.proposals.last().cloned();
         match outcome {
-            StepOutcome::Stopped if is_planted(Planted::GoesOnAfterStop) => {
-                newest.into_iter().for_each(|newest| self.begin(newest));
+            Some(StepOutcome::Stopped) if is_planted(Planted::GoesOnAfterStop) => {
+                newest
+                    .into_iter()
+                    .for_each(|newest| self.begin_again(newest));
             }
-            StepOutcome::Fault if is_planted(Planted::GoesOnAfterFault) => {
+            Some(StepOutcome::Fault) if is_planted(Planted::GoesOnAfterFault) => {
                 self.planted.begins_again = newest;
             }
-            StepOutcome::Stopped if is_planted(Planted::DropsOnStop) => {
-                let (driver, runtime) =
-                    (Arc::clone(&self.driver), tokio::runtime::Handle::current());
-                let mut robot = DriverRobot::new(driver, runtime, CancellationToken::new());
-                self.node.spawn_blocking(move || robot.set_suction(false));
+            Some(StepOutcome::Stopped) if is_planted(Planted::DropsOnStop) => {
+                // Nobody waits for it.
+                RunningMotion::begin(&self.node, &self.configured.driver, |robot, _| {
+                    let _ = robot.set_suction(false);
+                    Ok(None)
+                });
             }
             _ => {}
         }
@@ -88,11 +91,27 @@ impl Executor<'_> {
 
     /// Now and then.
     pub(super) fn plant_now_and_then(&mut self) {
-        if self.driver.unready().is_none()
+        if self.configured.driver.unready().is_none()
             && self.motion.is_none()
             && let Some(proposal) = self.planted.begins_again.take()
         {
-            self.begin(proposal);
+            self.begin_again(proposal);
         }
     }
+
+    /// Moves past the gate.
+    fn begin_again(&mut self, proposal: Proposal) {
+        let order = MotionOrder::Proposal(Box::new(proposal));
+        self.configured.protocol.on_motion_begin(order.cause());
+        self.keep_stop();
+        self.begin(order);
+    }
+}
+
+/// How the motion ended of whose end these actions speak.
+pub(super) fn outcome(actions: &[ExecutorAction]) -> Option<StepOutcome> {
+    actions.iter().find_map(|action| match action {
+        ExecutorAction::Say(said) if said.motion.is_some() => Some(said.report.outcome),
+        _ => None,
+    })
 }

@@ -186,7 +186,9 @@ def test_three_goals_run_side_by_side_one_is_cancelled_and_a_late_request_gets_i
     cancelled = peer.wait(third.cancel_goal_async(), "answer to the cancel")
     assert [bytes(info.goal_id.uuid) for info in cancelled.goals_canceling] == [bytes(third.goal_id.uuid)]
     assert ended(third) == (GoalStatus.STATUS_CANCELED, 3)
-    time.sleep(1.0)
+    # Another goal has come and gone before they are asked for again.
+    fourth = peer.wait(send(4, 5), "answer to a goal")
+    assert ended(fourth) == (GoalStatus.STATUS_SUCCEEDED, 4)
     assert ended(second) == (GoalStatus.STATUS_SUCCEEDED, 2)
     assert ended(third) == (GoalStatus.STATUS_CANCELED, 3)
     peer.wait(first.cancel_goal_async(), "answer to the cancel")
@@ -216,8 +218,9 @@ def test_latched_messages_reach_late_joiners_both_ways(start, peer: Peer, domain
     publisher = peer.node.create_publisher(Reward, "late/latched", LATCHED)
     publisher.publish(before)
     start("interface_echo", "--ros-args", "-r", "__ns:=/late")
-    wait_for_node(peer, "interface_echo", "/late")
-    time.sleep(5.0)
+    early = peer.listen(Reward, "late/latched_echoed", LATCHED)
+    peer.until(lambda: before in early, "latched message")
+    # It is there: who comes now is late.
     with Peer(domain, "late_joiner") as late:
         received = late.listen(Reward, "late/latched_echoed", LATCHED)
         late.until(lambda: before in received, "latched message")
@@ -439,8 +442,7 @@ def test_lifecycle_goes_through_all_transitions(start, peer: Peer) -> None:
     wait_for_node(peer, "camera_fusion", "/led")
     life = Life(peer, "/led/camera_fusion")
     peer.until(lambda: peer.node.count_publishers("/led/camera_fusion/transition_event"), "events")
-    # And until the node knows the listener, too.
-    time.sleep(3.0)
+    # The node knows the listener, too, once it answers a client: discovery tells of endpoints in the order in which they were made.
     assert life.state() == "unconfigured"
     states = peer.call(GetAvailableStates, "/led/camera_fusion/get_available_states").available_states
     assert {one.id for one in states} >= {0, 1, 2, 3, 4, 10, 11, 12, 13, 14, 15}

@@ -32,6 +32,7 @@ fn check(criterion: &mut Criterion) {
     let contacts = vec![Contact {
         center_m: Point2::new(0.45, -0.2),
         radius_m: 0.05,
+        above_m: f64::NEG_INFINITY,
         up_to_m: 0.06,
     }];
     let scene = Scene {

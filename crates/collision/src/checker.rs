@@ -67,8 +67,17 @@ pub struct Contact {
     pub center_m: Point2<f64>,
     /// Its radius.
     pub radius_m: f64,
-    /// The tool may touch what is in the circle up to this height. A carried object may touch anything in it.
+    /// The tool may touch what is in the circle and higher than this, ...
+    pub above_m: f64,
+    /// ... up to this height. A carried object may touch anything in it.
     pub up_to_m: f64,
+}
+
+impl Contact {
+    /// Whether the tool may touch something of this height in the circle.
+    fn allows(&self, height_m: f64) -> bool {
+        height_m > self.above_m && height_m <= self.up_to_m
+    }
 }
 
 /// What is there beside the cell, for one motion.
@@ -373,7 +382,7 @@ impl CollisionChecker {
                     let here = Point2::from(pose.translation.vector.xy());
                     if scene.contacts.iter().any(|contact| {
                         (here - contact.center_m).norm() <= contact.radius_m
-                            && (touches || top_m <= contact.up_to_m)
+                            && (touches || contact.allows(top_m))
                     }) {
                         continue;
                     }
@@ -406,7 +415,7 @@ impl CollisionChecker {
                         Some(_) => near_m.min(self.margins.slow_m),
                         None => near_m,
                     };
-                    let touch = here.any(|contact| touches || height_m <= contact.up_to_m);
+                    let touch = here.any(|contact| touches || contact.allows(height_m));
                     (!touch).then_some(margin_m)
                 });
                 let (distance_m, margin_m) = (found.distance_m, found.margin_m);

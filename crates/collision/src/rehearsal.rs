@@ -37,8 +37,10 @@ struct Rehearsal<'a> {
     /// What stands on the table, without what is carried.
     table: Option<Rc<Table>>,
     carried: Option<Carried>,
-    /// Where the tool is in contact.
-    contact: Option<Contact>,
+    /// Where the tool is in contact, and what it stands beside there.
+    contacts: Vec<Contact>,
+    /// How the tip comes down, where the heights of the surfaces are known.
+    touchdown: Option<Touchdown>,
     /// A descent that meets nothing leads no further below what was seen (m).
     sinks_m: f64,
     clearance: Rc<Cell<Clearance>>,
@@ -177,10 +179,11 @@ pub fn rehearse(
     let primitive = primitive.map_err(|error| failed(Outcome::Placed, error.into()))?;
     let mut robot = Rehearsal::new(checker, arm, joints, heightmap);
     robot.holds = holds;
+    robot.touchdown = touchdown.copied();
     robot.sinks_m += touchdown.map_or(0.0, |touchdown| touchdown.window_m);
     if (joints - arm.home).amax() > AT_HOME_RAD {
         // The arm may have been stopped on the table.
-        robot.contact = Some(robot.contact_here());
+        robot.contacts = vec![robot.contact_here()];
     }
     let clearance = Rc::clone(&robot.clearance);
     let mut branches = vec![Branch {
@@ -293,7 +296,8 @@ impl<'a> Rehearsal<'a> {
             seen: table.clone(),
             table,
             carried: None,
-            contact: None,
+            contacts: Vec::new(),
+            touchdown: None,
             sinks_m: ROUGH_M,
             clearance: Rc::new(Cell::new(Clearance {
                 least_m: f64::INFINITY,
@@ -315,7 +319,7 @@ impl<'a> Rehearsal<'a> {
         robot.holds = carried.is_some();
         robot.carried = carried;
         // The arm may have been stopped on the table.
-        robot.contact = Some(robot.contact_here());
+        robot.contacts = vec![robot.contact_here()];
         robot
     }
 }
@@ -335,6 +339,7 @@ impl Rehearsal<'_> {
             radius_m: self.checker.tool_radius_m()
                 + CUP_M.max(held_m)
                 + self.checker.margins().obstacle_m,
+            above_m: f64::NEG_INFINITY,
             up_to_m: tip.z + ROUGH_M,
         }
     }
@@ -411,11 +416,18 @@ impl Rehearsal<'_> {
 
     /// Has a command answered as it is where an action ends so.
     fn turn(&mut self, command: &Command, ends: Outcome) -> Result<Report, Box<Collision>> {
+        // Height of the tip where what is carried would meet the surface.
+        let loaded_m = match command {
+            Command::FollowUntilContact(descent) => {
+                self.surface_m(self.below(descent)) + self.hangs_m()
+            }
+            _ => 0.0,
+        };
         self.lose();
         let Command::FollowUntilContact(descent) = command else {
             if ends == Outcome::GraspFailed {
                 // The tool was lifted straight up beside what stands there, and goes on straight up.
-                self.contact = Some(self.contact_here());
+                self.contacts = vec![self.contact_here()];
             }
             return Ok(Report::Holds(false));
         };
@@ -426,8 +438,15 @@ impl Rehearsal<'_> {
             up_to_m: surface_m + ROUGH_M,
             ..self.contact_at(&descent.last().positions_rad)
         };
-        self.check(&descent, vec![contact])?;
-        self.contact = Some(contact);
+        // What is higher than the tip where the object was to meet the surface stands beside the tool there, as expected. Further straight down it
+        // does so still.
+        let beside = Contact {
+            above_m: loaded_m,
+            up_to_m: loaded_m + ROUGH_M,
+            ..contact
+        };
+        self.contacts = vec![contact, beside];
+        self.check(&descent, self.contacts.clone())?;
         Ok(match ends {
             Outcome::NoContact => Report::NoContact(self.joints),
             _ => Report::Contact(self.joints),
@@ -452,6 +471,13 @@ impl Rehearsal<'_> {
         Point2::from(end.translation.vector.xy())
     }
 
+    /// How far what is carried hangs below the tip.
+    fn hangs_m(&self) -> f64 {
+        self.carried.map_or(0.0, |carried| {
+            carried.tip_from_shape.translation.z + carried.shape.extent_m(&Vector3::z())
+        })
+    }
+
     /// Height of the highest thing within the cup, 0 without a heightmap.
     fn surface_m(&self, at: Point2<f64>) -> f64 {
         let around = Vector3::repeat(0.5 * CUP_M).xy();
@@ -471,9 +497,11 @@ impl Robot for Rehearsal<'_> {
     }
 
     fn follow(&mut self, trajectory: &JointTrajectory) -> Result<bool, Box<Collision>> {
-        let contact = self.contact.take();
-        let contact = contact.or_else(|| self.contact_below(trajectory));
-        self.check(trajectory, contact.into_iter().collect())?;
+        let mut contacts = std::mem::take(&mut self.contacts);
+        if contacts.is_empty() {
+            contacts.extend(self.contact_below(trajectory));
+        }
+        self.check(trajectory, contacts)?;
         Ok(true)
     }
 
@@ -481,14 +509,21 @@ impl Robot for Rehearsal<'_> {
         &mut self,
         trajectory: &JointTrajectory,
     ) -> Result<bool, Box<Collision>> {
-        let hangs_m = self.carried.map_or(0.0, |carried| {
-            carried.tip_from_shape.translation.z + carried.shape.extent_m(&Vector3::z())
-        });
-        let stop_m = self.surface_m(self.below(trajectory)) + hangs_m;
-        let (descent, meets) = self.until(trajectory, stop_m);
+        let surface_m = self.surface_m(self.below(trajectory));
+        // Where the surfaces are known the tip comes down on them: single cells may be wrong, or show what is beside the tool.
+        let expected_m = match self.touchdown {
+            Some(touchdown) if self.holds => touchdown.place_m,
+            Some(touchdown) => touchdown.pick_m,
+            None => surface_m,
+        };
+        let hangs_m = self.hangs_m();
+        let (descent, meets) = self.until(trajectory, expected_m + hangs_m);
         let contact = self.contact_at(&descent.last().positions_rad);
-        self.check(&descent, vec![contact])?;
-        self.contact = Some(contact);
+        self.contacts = vec![Contact {
+            up_to_m: contact.up_to_m.max(surface_m + hangs_m + ROUGH_M),
+            ..contact
+        }];
+        self.check(&descent, self.contacts.clone())?;
         Ok(meets)
     }
 
@@ -505,11 +540,12 @@ impl Robot for Rehearsal<'_> {
             self.table = Some(Table::new(rest));
             self.carried = Some(carried);
             // As wide as what is held: what stands beside it is passed on the way straight up, and on that way only.
-            self.contact = Some(self.contact_here());
+            self.contacts = vec![self.contact_here()];
         }
         // The cup may have been pressed on.
-        let here = self.contact_here();
-        self.contact.get_or_insert(here);
+        if self.contacts.is_empty() {
+            self.contacts = vec![self.contact_here()];
+        }
         Ok(())
     }
 

@@ -9,10 +9,12 @@ use nalgebra::{Isometry2, Isometry3, Point2, Point3, Vector2, Vector3};
 use pick_place::{Outcome, PickPlace, PrimitiveSettings, Robot, Touchdown};
 use proptest::prelude::*;
 use std::convert::Infallible;
+use std::sync::LazyLock;
 use ur5::{Arm, JointTrajectory, Joints, Shape, WorkCell};
 
 fn cell() -> WorkCell {
-    WorkCell::builtin().unwrap()
+    static CELL: LazyLock<WorkCell> = LazyLock::new(|| WorkCell::builtin().unwrap());
+    CELL.clone()
 }
 
 fn checker(cell: &WorkCell) -> CollisionChecker {
@@ -77,6 +79,7 @@ fn contacts(arm: &Arm, motion: &JointTrajectory, radius_m: f64) -> Vec<Contact> 
         .map(|tip| Contact {
             center_m: Point2::from(tip.xy()),
             radius_m,
+            above_m: f64::NEG_INFINITY,
             up_to_m: 0.02,
         })
         .collect()
@@ -130,11 +133,14 @@ proptest! {
             let bodies: Vec<_> = cell.posed(&cell.collisions, &joints).collect();
             for (body, pose) in bodies.iter().filter(|(body, _)| body.moving_link.is_some()) {
                 for (other, other_pose) in bodies.iter().filter(|(body, _)| body.moving_link.is_none()) {
-                    if other.link == "base_link_inertia" {
+                    let distance_m = |point| other.shape.distance_m(&other_pose.inverse_transform_point(&(pose * point)));
+                    // No point of the surface is nearer than this.
+                    let bound_m = distance_m(Point3::origin()) - radius_m(&body.shape);
+                    if other.link == "base_link_inertia" || bound_m >= least.0 {
                         continue;
                     }
                     for point in surface(&body.shape) {
-                        let distance_m = other.shape.distance_m(&other_pose.inverse_transform_point(&(pose * point)));
+                        let distance_m = distance_m(point);
                         if distance_m < least.0 {
                             least = (distance_m, format!("{} and {}", body.link, other.link));
                         }
@@ -194,6 +200,14 @@ proptest! {
         };
         prop_assert!(!check(wide, 0.004) || check(0.005, 0.0));
     }
+}
+
+/// Radius of a ball about the middle of a shape that holds all of it.
+fn radius_m(shape: &Shape) -> f64 {
+    let Shape::Cylinder { radius_m, length_m } = *shape else {
+        panic!("the arm is made of cylinders");
+    };
+    radius_m.hypot(0.5 * length_m)
 }
 
 /// Points on a shape.
@@ -284,6 +298,7 @@ fn what_is_carried_counts_and_contact_is_allowed_only_where_it_is_wanted() {
     let contact = |up_to_m| Contact {
         center_m: Point2::new(0.5, 0.0),
         radius_m: 0.06,
+        above_m: f64::NEG_INFINITY,
         up_to_m,
     };
     let collision = checker.check(&descent, &scene(None, vec![])).unwrap_err();
@@ -306,6 +321,7 @@ fn what_is_carried_counts_and_contact_is_allowed_only_where_it_is_wanted() {
     let here = Contact {
         center_m: Point2::new(0.5, -0.2),
         radius_m: 0.05,
+        above_m: f64::NEG_INFINITY,
         up_to_m: 0.02,
     };
     let allowed = Scene {
@@ -619,6 +635,70 @@ fn a_low_way_over_a_cable_is_refused_also_where_nothing_is_seen_that_would_be_ca
     );
     rehearsed(&cable, 0.05).unwrap();
     rehearsed(&empty_table(), 0.012).unwrap();
+}
+
+/// A block of 30 x 30 mm, as high as that, and something of other cells beside the place: what a rehearsal of its way there says, with the heights
+/// of the surfaces known.
+fn rehearsed_beside(
+    object_m: f32,
+    place: Vector2<f64>,
+    (rows, cols, beside_m): (std::ops::Range<usize>, std::ops::Range<usize>, f32),
+) -> Result<Outcome, String> {
+    let cell = cell();
+    let (mut heightmap, mut action) = block_beside_a_wall(0.005, 0.0);
+    for height_m in heightmap.height_m.iter_mut().filter(|m| **m > 0.0) {
+        *height_m = object_m;
+    }
+    for row in rows {
+        heightmap.height_m[row * 160 + cols.start..row * 160 + cols.end].fill(beside_m);
+    }
+    action.place = Isometry2::new(place, 0.0);
+    let touchdown = Touchdown {
+        pick_m: object_m.into(),
+        pick_ground_m: 0.0,
+        place_m: 0.0,
+        slow_from_m: 0.03,
+        slow_m_s: 0.05,
+        window_m: 0.015,
+        press_m: 0.0,
+        senses_pick: true,
+        senses_place: true,
+    };
+    let situation = Situation {
+        joints: &cell.arm.home,
+        holds: false,
+        heightmap: Some(&heightmap),
+        touchdown: Some(&touchdown),
+    };
+    let settings = PrimitiveSettings::RIGID;
+    let rehearsed = rehearse(&checker(&cell), &cell.arm, &action, &settings, &situation);
+    rehearsed
+        .map(|(outcome, _)| outcome)
+        .map_err(|error| error.to_string())
+}
+
+#[test]
+fn a_tool_that_has_lost_its_object_goes_on_down_beside_what_it_stood_beside_and_no_further() {
+    // 2 mm from the cup, whose radius is 10 mm.
+    let place = Vector2::new(0.25 + 84.0 * 0.003125 - 0.012, 0.2);
+    let beside =
+        |object_m, beside_m| rehearsed_beside(object_m, place, (216..232, 84..90, beside_m));
+    // With the object the tip comes to 12 mm, beside something of 25 mm; without it to the table.
+    assert_eq!(beside(0.012, 0.025), Ok(Outcome::Placed));
+    // Here it would have stayed above that.
+    let refused = beside(0.04, 0.03).unwrap_err();
+    assert!(
+        refused.starts_with("if the object is lost on its way: DescendToPlace"),
+        "{refused}"
+    );
+}
+
+#[test]
+fn where_the_surfaces_are_known_a_wrong_cell_beside_the_place_is_not_taken_for_the_contact() {
+    let place = Vector2::new(0.25 + 84.0 * 0.003125 - 0.008, 0.2);
+    let row = Workspace::RAVENS.pixel(&Point2::from(place)).unwrap().row;
+    let found = rehearsed_beside(0.012, place, (row..row + 1, 84..85, 0.03));
+    assert_eq!(found, Ok(Outcome::Placed));
 }
 
 /// The built-in cell with a ball of 20 mm that hangs in the air.

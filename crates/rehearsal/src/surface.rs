@@ -1,12 +1,17 @@
 //! Heights of the surfaces under a proposal, as they were seen.
 
-use collision::{CUP_RADIUS_M, FOOT_RADIUS_M, TOP, quantile_m};
 use heightmap::Heightmap;
 use nalgebra::Point2;
 use pick_place::{ContactSettings, ContactSign, PickPlace, Touchdown};
 
+/// The cup rests on what is this near (m).
+const CUP_RADIUS_M: f64 = 0.008;
+/// An object that is put down rests on what is this near, at least (m).
+const FOOT_RADIUS_M: f64 = 0.015;
 /// What lies beside an object is this near (m).
 const BESIDE_M: f64 = 0.08;
+/// Of the cells around a pose this share is lower than the top: single cells may be wrong.
+const TOP: f64 = 0.9;
 /// Of the cells beside an object this share is lower than its ground.
 const GROUND: f64 = 0.05;
 
@@ -53,6 +58,36 @@ pub fn touchdown(
 /// The height of what the cup meets at a point (m); `None` where none was seen.
 pub(crate) fn top_m(heightmap: &Heightmap, at: &Point2<f64>) -> Option<f64> {
     quantile_m(heightmap, at, CUP_RADIUS_M, TOP)
+}
+
+/// The height that a share of the cells around a point do not exceed (m); `None` where none was seen.
+fn quantile_m(
+    heightmap: &Heightmap,
+    center: &Point2<f64>,
+    radius_m: f64,
+    share: f64,
+) -> Option<f64> {
+    let workspace = &heightmap.workspace;
+    let center_px = workspace.point_px(center);
+    let radius_px = (radius_m / workspace.pixel_size_m).max(1.0);
+    let range = |middle: f64, count: usize| {
+        let low = (middle - radius_px).floor().max(0.0) as usize;
+        let high = (middle + radius_px).ceil().max(0.0) as usize;
+        low..high.min(count)
+    };
+    let mut heights_m = Vec::new();
+    for row in range(center_px.y, workspace.rows) {
+        for col in range(center_px.x, workspace.cols) {
+            let middle = Point2::new(col as f64 + 0.5, row as f64 + 0.5);
+            let index = row * workspace.cols + col;
+            if (middle - center_px).norm() <= radius_px && heightmap.is_seen(index) {
+                heights_m.push(heightmap.height_m[index]);
+            }
+        }
+    }
+    heights_m.sort_by(f32::total_cmp);
+    let last = heights_m.len().checked_sub(1)?;
+    Some(heights_m[(share * last as f64).round() as usize].into())
 }
 
 #[cfg(test)]

@@ -270,7 +270,9 @@ fn approvals_of_scene(problem: &str, number: usize, seed: u64, realsense: &Pertu
 
 #[test]
 fn no_approval_is_refused_for_noise_and_a_small_object_beside_the_place_always_is_noticed() {
-    let realsense = model("realsense");
+    let mut realsense = model("realsense");
+    // The gate compares heights, and no height depends on the noise of the colours: for each image it is drawn last. It takes half of the time.
+    realsense.color.noise = 0.0;
     let problems = ["placing", "stacking", "chaining", "routing"];
     let scenes: Vec<_> = problems
         .iter()

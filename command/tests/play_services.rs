@@ -72,14 +72,19 @@ async fn a_paused_player_goes_message_by_message_and_on_when_told() -> Result<()
         );
         assert_eq!(next(&mut texts).await?, expected);
     }
-    tokio::time::sleep(Duration::from_millis(500)).await;
-    assert!(texts.try_recv().is_none(), "it is paused");
     let refused =
         call::<services::SetRate>(&node, "set_rate", services::SetRateRequest { rate: 0.0 });
     assert!(!refused.await?.success);
     let set =
         call::<services::SetRate>(&node, "set_rate", services::SetRateRequest { rate: 2000.0 });
     assert!(set.await?.success);
+    // At this rate the next one would have come.
+    assert!(
+        call::<services::IsPaused>(&node, "is_paused", Default::default())
+            .await?
+            .paused
+    );
+    assert!(texts.try_recv().is_none(), "it is paused");
     call::<services::Resume>(&node, "resume", Default::default()).await?;
     assert_eq!(next(&mut texts).await?, "2");
     assert_eq!(next(&mut texts).await?, "3");

@@ -6,6 +6,7 @@ use bags::{Demonstration, DemonstrationStep};
 use goal_oracle::GoalOracleParameters;
 use heightmap::{Heightmap, Workspace};
 use msgs::convert;
+use msgs::diagnostic_msgs::{DiagnosticArray, DiagnosticStatus};
 use msgs::sctn_msgs::{ConfirmationRefused, Goal, PickPlace, StepConfirmation, StepResult};
 use nalgebra::Isometry2;
 use node_kit::{Context, Network, NoParameters, ParameterSource, Qos, RosArguments, Subscription};
@@ -107,6 +108,9 @@ async fn results_and_confirmations_walk_through_a_demonstration() {
         .subscription::<ConfirmationRefused>("confirmation_refused", Qos::Event)
         .unwrap();
     let mut goals = node.subscription::<Goal>("goal", Qos::Latched).unwrap();
+    let mut diagnostics = node
+        .subscription::<DiagnosticArray>("/diagnostics", Qos::Event)
+        .unwrap();
     let arguments = RosArguments {
         parameters: vec![ParameterSource::Argument {
             node: None,
@@ -133,8 +137,8 @@ async fn results_and_confirmations_walk_through_a_demonstration() {
     );
 
     // An operator looks before speaking, and a motion takes its time: the proposal is there before its result.
-    let pause = || tokio::time::sleep(Duration::from_secs(1));
-    let propose = async |id, step, attempt| {
+    let mut proposed = 0;
+    let mut propose = async |id, step, attempt| {
         proposals.publish(PickPlace {
             id,
             problem: "placing".into(),
@@ -143,7 +147,16 @@ async fn results_and_confirmations_walk_through_a_demonstration() {
             settings: convert::settings_to_msg(&PrimitiveSettings::RIGID),
             ..PickPlace::default()
         });
-        pause().await;
+        proposed += 1;
+        let text = format!("in messages={proposed} ");
+        let has_read = |status: &DiagnosticStatus| {
+            let values = status.values.iter();
+            let mut values = values.filter(|value| value.key == "/pick_place");
+            status.name == "/goal_oracle: topics"
+                && values.any(|value| value.value.starts_with(&text))
+        };
+        let read = async { while !diagnostics.recv().await.status.iter().any(has_read) {} };
+        timeout(LIMIT, read).await.expect("counters");
     };
     propose(11, 1, 0).await;
     results.publish(result(11, StepResult::REJECTED, 3));

@@ -12,6 +12,7 @@ use msgs::rcl_interfaces::{
     Parameter, ParameterType, ParameterValue, SetParameters, SetParametersRequest,
 };
 use msgs::sensor_msgs::{Image, JointState};
+use msgs::std_msgs::Header;
 use msgs::ur_dashboard_msgs::{RobotMode, SafetyMode};
 use msgs::ur_msgs::{IOStates, SetIO, SetIORequest};
 use node_kit::{
@@ -73,6 +74,10 @@ fn turn(
         trajectory: convert::joint_trajectory_to_msg(&trajectory, &cell.joint_names).unwrap(),
         ..Default::default()
     }
+}
+
+fn time_of(header: &Header) -> Duration {
+    convert::time_from_msg(&header.stamp).unwrap()
 }
 
 async fn newest(subscription: &mut Subscription<JointState>) -> JointState {
@@ -144,13 +149,17 @@ async fn goals_are_checked_carried_out_one_at_a_time_and_cancelled() {
     assert_eq!(status, GoalStatus::Canceled);
     let stopped = at_rest(&mut joint_states).await;
     assert!(stopped.velocity.iter().all(|velocity| *velocity == 0.0));
-    tokio::time::sleep(Duration::from_millis(300)).await;
-    assert_eq!(newest(&mut joint_states).await, stopped);
 
-    // From there it can be sent on.
+    // From there it can be sent on, and until then it stands there.
     let at = convert::joints_from_msg(&stopped, &cell.joint_names).unwrap();
     let on = turn(&cell, at, 0.1, Duration::from_millis(500));
     let sent = client.send_goal(&on, &options).await.unwrap();
+    let mut next = stopped.clone();
+    while next == stopped {
+        next = within("joint_states", joint_states.recv()).await;
+    }
+    let passed = time_of(&next.header) - time_of(&stopped.header);
+    assert!(passed < Duration::from_millis(100), "{passed:?}");
     let (status, result) = within("result", sent.result()).await.unwrap();
     assert_eq!(
         (status, result.error_code),
@@ -170,20 +179,30 @@ async fn who_comes_late_hears_the_status_and_sees_the_frames_and_nothing_while_t
     let (sim, _own, node) = start(&[("frames_period_s", "0.1")]);
     let client = node.action_client::<FollowJointTrajectory>(FOLLOW).unwrap();
     client.wait_for_server(PATIENCE).await.unwrap();
-    tokio::time::sleep(Duration::from_secs(1)).await;
-
     let status = |name| format!("io_and_status_controller/{name}");
-    let mut robot_mode = node
-        .subscription::<RobotMode>(&status("robot_mode"), Qos::Latched)
-        .unwrap();
+    let robot_mode = || {
+        let topic = status("robot_mode");
+        node.subscription::<RobotMode>(&topic, Qos::Latched)
+            .unwrap()
+    };
+    let color = || {
+        let topic = "left/color/image_raw";
+        node.subscription::<Image>(topic, Qos::Image).unwrap()
+    };
+    // Somebody has heard and seen it before.
+    within("robot_mode", robot_mode().recv()).await;
+    within("frame", color().recv()).await;
+
+    let mut robot_mode = robot_mode();
     let mut safety_mode = node
         .subscription::<SafetyMode>(&status("safety_mode"), Qos::Latched)
         .unwrap();
     let mut io_states = node
         .subscription::<IOStates>(&status("io_states"), Qos::Event)
         .unwrap();
-    let mut color = node
-        .subscription::<Image>("left/color/image_raw", Qos::Image)
+    let mut color = color();
+    let mut joint_states = node
+        .subscription::<JointState>("joint_states", Qos::Event)
         .unwrap();
     assert_eq!(
         within("robot_mode", robot_mode.recv()).await.mode,
@@ -241,10 +260,11 @@ async fn who_comes_late_hears_the_status_and_sees_the_frames_and_nothing_while_t
         within("result", sent.result()).await.unwrap().0,
         GoalStatus::Succeeded
     );
-    tokio::time::sleep(Duration::from_millis(300)).await;
-    while color.try_recv().is_some() {}
-    let none = tokio::time::timeout(Duration::from_millis(500), color.recv()).await;
-    assert!(none.is_err(), "a frame while the arm is out");
+    let there = time_of(&at_rest(&mut joint_states).await.header);
+    // Half a second: frames come every 0.1 s.
+    for _ in 0..25 {
+        within("joint_states", joint_states.recv()).await;
+    }
     let mut at = cell.arm.home;
     at[0] += 0.3;
     let back = turn(&cell, at, -0.3, Duration::from_secs(1));
@@ -256,8 +276,15 @@ async fn who_comes_late_hears_the_status_and_sees_the_frames_and_nothing_while_t
         within("result", sent.result()).await.unwrap().0,
         GoalStatus::Succeeded
     );
-    let after = within("frame", color.recv()).await;
-    assert!(after.header.stamp.sec > first.header.stamp.sec);
+    loop {
+        let frame = within("frame", color.recv()).await;
+        if frame.header.stamp != first.header.stamp {
+            let taken = time_of(&frame.header);
+            // Back home, a second later.
+            assert!(taken > there, "a frame while the arm is out");
+            break;
+        }
+    }
     sim.shutdown();
 }
 

@@ -347,6 +347,51 @@ mod tests {
         assert!(whole != trained(1, None), "another seed");
     }
 
+    /// Names the number of threads to [`training_in_its_own_process`].
+    const THREADS: &str = "LEARNING_TEST_THREADS";
+
+    /// Run by the test below: other tests of this process have threads, too.
+    #[test]
+    #[ignore = "a part of the test below"]
+    fn training_in_its_own_process() {
+        let threads = || std::fs::read_dir("/proc/self/task").unwrap().count();
+        let mut recipe = recipe(0);
+        recipe.training.threads = std::env::var(THREADS).unwrap().parse().unwrap();
+        let folder = tempfile::tempdir().unwrap();
+        let before = threads();
+        let mut training = Training::open(recipe, data(), folder.path(), false).unwrap();
+        // The second batch was drawn beside the first step.
+        for _ in 0..2 {
+            training.advance().unwrap();
+        }
+        println!("{} threads more", threads() - before);
+    }
+
+    #[test]
+    fn libtorch_has_as_many_threads_as_a_training_is_told_and_one_more_draws_the_samples() {
+        let more = |threads: usize| {
+            let test = "training::tests::training_in_its_own_process";
+            let output = std::process::Command::new(std::env::current_exe().unwrap())
+                .args(["--ignored", "--exact", test, "--nocapture"])
+                .env(THREADS, threads.to_string())
+                .output()
+                .unwrap();
+            let text = String::from_utf8(output.stdout).unwrap();
+            let words: Vec<&str> = text.split_whitespace().collect();
+            let found = words
+                .windows(3)
+                .find(|words| words[1..] == ["threads", "more"]);
+            let number = found.and_then(|words| words[0].parse::<usize>().ok());
+            number.unwrap_or_else(|| panic!("{text}"))
+        };
+        // One draws the samples. Each pool of libtorch has the calling thread besides: their threads grow with the number, not with its square.
+        let pools = more(2) - 1;
+        assert!(pools > 0, "{pools}");
+        for threads in [1, 3, 5] {
+            assert_eq!(more(threads), 1 + pools * (threads - 1), "{threads}");
+        }
+    }
+
     #[test]
     fn a_training_begins_with_the_weights_of_a_checkpoint() {
         let folder = tempfile::tempdir().unwrap();

@@ -38,10 +38,10 @@ pub fn run_checks(chosen: &[String]) -> Result<()> {
         return Ok(());
     }
     println!("check: tests of {}", list(&changed));
-    let folders = packages
+    let chosen = packages
         .iter()
         .filter(|package| changed.contains(&package.name));
-    unit_tests::of_folders(&folders.map(|package| package.folder.clone()).collect())?;
+    unit_tests::of_packages(&chosen.collect::<Vec<_>>())?;
     println!("check: clippy");
     run(&mut clippy())?;
     println!("check: passed in {:.0} s", start.elapsed().as_secs_f64());

@@ -149,6 +149,7 @@ mod tests {
             name: name.to_owned(),
             folder: folder.into(),
             uses: uses.iter().map(|&name| name.to_owned()).collect(),
+            tested: BTreeSet::new(),
         }
     }
 

@@ -14,6 +14,28 @@ pub struct Package {
     pub folder: PathBuf,
     /// Packages of the workspace that its library or program uses; not those that only its tests use.
     pub uses: BTreeSet<String>,
+    /// What of it has unit tests.
+    pub tested: BTreeSet<TestTarget>,
+}
+
+/// A target with tests, as Cargo is told of it.
+#[derive(Clone, Debug, PartialEq, Eq, PartialOrd, Ord)]
+pub enum TestTarget {
+    Library,
+    Program(String),
+    /// A file of the folder `tests`.
+    Tests(String),
+}
+
+impl TestTarget {
+    /// What selects it, and those of its name in other packages.
+    pub fn arguments(&self) -> Vec<&str> {
+        match self {
+            Self::Library => vec!["--lib"],
+            Self::Program(name) => vec!["--bin", name],
+            Self::Tests(name) => vec!["--test", name],
+        }
+    }
 }
 
 #[derive(Deserialize)]
@@ -26,6 +48,34 @@ struct MetadataPackage {
     name: String,
     manifest_path: PathBuf,
     dependencies: Vec<Dependency>,
+    targets: Vec<Target>,
+}
+
+#[derive(Deserialize)]
+struct Target {
+    name: String,
+    kind: Vec<String>,
+    test: bool,
+    #[serde(default, rename = "required-features")]
+    required_features: Vec<String>,
+}
+
+impl Target {
+    /// What it has tests for; nothing where Cargo would not build it by itself.
+    fn tested(&self) -> Option<TestTarget> {
+        let is = |kinds: &[&str]| self.kind.iter().any(|kind| kinds.contains(&kind.as_str()));
+        if !self.test || !self.required_features.is_empty() {
+            return None;
+        }
+        if is(&["lib", "rlib", "dylib", "cdylib", "staticlib", "proc-macro"]) {
+            return Some(TestTarget::Library);
+        }
+        let name = self.name.clone();
+        match is(&["bin"]) {
+            true => Some(TestTarget::Program(name)),
+            false => is(&["test"]).then_some(TestTarget::Tests(name)),
+        }
+    }
 }
 
 #[derive(Deserialize)]
@@ -57,6 +107,7 @@ pub fn of_workspace() -> Result<Vec<Package>> {
             .filter(|name| ours.contains(name))
             .collect();
         packages.push(Package {
+            tested: package.targets.iter().filter_map(Target::tested).collect(),
             uses,
             name: package.name,
             folder,
@@ -83,6 +134,45 @@ mod tests {
             name: name.to_owned(),
             folder: name.into(),
             uses: BTreeSet::new(),
+            tested: BTreeSet::new(),
+        }
+    }
+
+    #[test]
+    fn what_cargo_tests_by_itself_is_selected_by_kind_and_name() {
+        let target = |json: &str| {
+            let target: Target = serde_json::from_str(json).unwrap();
+            let tested = target.tested();
+            tested.map(|target| target.arguments().join(" "))
+        };
+        for (json, expected) in [
+            (
+                r#"{"name":"bags","kind":["lib"],"test":true}"#,
+                Some("--lib"),
+            ),
+            (
+                r#"{"name":"multiravens","kind":["cdylib"],"test":true}"#,
+                Some("--lib"),
+            ),
+            (
+                r#"{"name":"sctn","kind":["bin"],"test":true}"#,
+                Some("--bin sctn"),
+            ),
+            (
+                r#"{"name":"older","kind":["test"],"test":true}"#,
+                Some("--test older"),
+            ),
+            (r#"{"name":"check","kind":["bench"],"test":false}"#, None),
+            (
+                r#"{"name":"build-script-build","kind":["custom-build"],"test":false}"#,
+                None,
+            ),
+            (
+                r#"{"name":"planted","kind":["bin"],"test":true,"required-features":["planted_faults"]}"#,
+                None,
+            ),
+        ] {
+            assert_eq!(target(json).as_deref(), expected, "{json}");
         }
     }
 

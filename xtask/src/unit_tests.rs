@@ -1,10 +1,11 @@
 //! Unit tests: Cargo compiles the test programs, and this runs them two at a time, as many wait for other processes or for time to
 //! pass.
 //!
-//! Everything is compiled of the whole workspace, also where a few packages are tested: for these alone Cargo would choose other
-//! features of what is not ours, and compile it again.
+//! Everything is compiled as a part of the whole workspace, also where a few packages are tested: for these alone Cargo would choose other
+//! features of what is not ours, and compile it again. Of other packages it compiles only what has the kind or the name of a target of these.
 
 use crate::command::{cargo, command, run, shown};
+use crate::packages::{Package, TestTarget};
 use anyhow::{Context as _, Result, ensure};
 use serde::Deserialize;
 use std::collections::BTreeSet;
@@ -20,17 +21,23 @@ const TEST: [&str; 3] = ["test", "--workspace", "--release"];
 
 /// The tests of all packages, documentation examples with them.
 pub fn of_workspace() -> Result<()> {
-    run_all(&built()?)?;
+    run_all(&built(&BTreeSet::new())?)?;
     run(cargo().args(TEST).arg("--doc"))
 }
 
-/// The tests of the packages in these folders, relative to the repository root.
-pub fn of_folders(folders: &BTreeSet<PathBuf>) -> Result<()> {
-    let chosen = |program: &Program| folders.iter().any(|folder| program.is_in(folder));
-    let programs: Vec<_> = built()?.into_iter().filter(chosen).collect();
+/// The tests of these packages.
+pub fn of_packages(packages: &[&Package]) -> Result<()> {
+    let targets = packages.iter().flat_map(|package| &package.tested);
+    let targets: BTreeSet<&TestTarget> = targets.collect();
+    let chosen = |program: &Program| packages.iter().any(|p| program.is_in(&p.folder));
+    let programs = match targets.is_empty() {
+        true => Vec::new(),
+        false => built(&targets)?,
+    };
+    let programs: Vec<_> = programs.into_iter().filter(chosen).collect();
     run_all(&programs)?;
     // The names of documentation examples begin with their file.
-    let files = folders.iter().map(|folder| folder.join("src"));
+    let files = packages.iter().map(|package| package.folder.join("src"));
     run(cargo()
         .args(TEST)
         .args(["--doc", "--quiet", "--"])
@@ -65,11 +72,12 @@ struct Profile {
     test: bool,
 }
 
-/// Compiles the test programs of all packages.
-fn built() -> Result<Vec<Program>> {
+/// Compiles the test programs of all packages: those of these targets, or all where there are none.
+fn built(targets: &BTreeSet<&TestTarget>) -> Result<Vec<Program>> {
     let mut build = cargo();
     build
         .args(TEST)
+        .args(targets.iter().flat_map(|target| target.arguments()))
         .args(["--no-run", "--message-format=json-render-diagnostics"])
         .stderr(Stdio::inherit());
     let output = build.output().context("cannot start cargo")?;

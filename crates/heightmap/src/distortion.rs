@@ -298,11 +298,10 @@ impl Radial {
                         slope[i + j] += a * b * (1.0 + 2.0 * (i as f64 - j as f64));
                     }
                 }
-                let first = |polynomial: &[f64]| {
-                    roots(polynomial, WIDEST).first().copied().unwrap_or(WIDEST)
-                };
-                // Where the denominator ends the factor has no value: just before it, it has.
-                first(&slope).min(first(&below) * (1.0 - 1e-9))
+                let first = |polynomial: &[f64]| roots(polynomial, WIDEST).first().copied();
+                let fold = first(&slope).unwrap_or(WIDEST);
+                // The factor has no value where the denominator is 0: just before it, it has.
+                first(&below).map_or(fold, |pole| fold.min(pole * (1.0 - 1e-9)))
             }
             Self::Equidistant([k1, k2, k3, k4]) => {
                 let slope = [1.0, 3.0 * k1, 5.0 * k2, 7.0 * k3, 9.0 * k4];

@@ -8,8 +8,6 @@ use std::{
 
 use tracing::warn;
 
-use crate::context::ContextError;
-
 /// What an enclave has, by the names of `ros2 security`.
 const FILES: [&str; 6] = [
     "identity_ca.cert.pem",
@@ -36,6 +34,16 @@ pub(crate) struct Security {
 /// What is wrong with the files of an enclave.
 #[derive(Debug, thiserror::Error)]
 pub enum SecurityError {
+    /// An environment variable makes no sense.
+    #[error("environment variable {name}={value}: expected {expected}")]
+    Variable {
+        /// Its name.
+        name: &'static str,
+        /// Its value.
+        value: String,
+        /// What it may be.
+        expected: &'static str,
+    },
     /// ROS_SECURITY_KEYSTORE is not set.
     #[error(
         "ROS_SECURITY_KEYSTORE is not set: expected the folder that `ros2 security create_keystore` made"
@@ -63,10 +71,10 @@ impl Security {
     /// Nothing where security is off.
     pub(crate) fn from_variables(
         read: impl Fn(&str) -> Option<String>,
-    ) -> Result<Option<Self>, ContextError> {
+    ) -> Result<Option<Self>, SecurityError> {
         let set = |name| read(name).filter(|value| !value.is_empty());
         let bad = |name, value: &str, expected| {
-            Err(ContextError::Environment {
+            Err(SecurityError::Variable {
                 name,
                 value: value.to_owned(),
                 expected,
@@ -79,7 +87,7 @@ impl Security {
             Some(other) => return bad("ROS_SECURITY_ENABLE", other, "true or false"),
         }
         if cfg!(not(feature = "security")) {
-            return Err(SecurityError::NotBuilt.into());
+            return Err(SecurityError::NotBuilt);
         }
         let enforce = match set("ROS_SECURITY_STRATEGY").as_deref() {
             Some("Enforce") => true,
@@ -151,7 +159,7 @@ pub(crate) fn check_supported(folder: &Path) -> Result<(), SecurityError> {
 mod tests {
     use super::*;
 
-    fn security(variables: &[(&str, &str)]) -> Result<Option<Security>, ContextError> {
+    fn security(variables: &[(&str, &str)]) -> Result<Option<Security>, SecurityError> {
         Security::from_variables(|name| {
             variables
                 .iter()

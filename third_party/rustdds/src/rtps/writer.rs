@@ -582,10 +582,17 @@ impl Writer {
   // send, or the writer-wide minimum over all matched readers for a
   // multicast-to-all send (one datagram shared by every reader).
   fn datagram_budget(&self, target_reader_opt: Option<&RtpsReaderProxy>) -> usize {
-    match target_reader_opt {
+    let budget = match target_reader_opt {
       Some(reader) => reader.max_datagram_payload(),
       None => self.min_datagram_payload,
-    }
+    };
+    // What protects a message makes it longer.
+    #[cfg(feature = "security")]
+    let budget = match self.security_plugins {
+      Some(_) => budget.saturating_sub(PROTECTION_OVERHEAD),
+      None => budget,
+    };
+    budget
   }
 
   /// Largest serialized payload that goes into one unfragmented DATA submessage:
@@ -2234,6 +2241,12 @@ impl HasQoSPolicy for Writer {
     self.qos_policies.clone()
   }
 }
+
+// By how much a datagram grows at most when it is protected: headers and footers
+// of the payload, of two submessages and of the message, 44, 2 x 64 and 80 bytes,
+// and 20 for each receiver that is authenticated by a key of its own.
+#[cfg(feature = "security")]
+const PROTECTION_OVERHEAD: usize = 1024;
 
 // Serialized overhead of one DATA submessage excluding its serialized payload
 // and inline QoS. Conservative fixed fields only; underestimating inline QoS

@@ -281,12 +281,17 @@ pub const ECDH_KAGREE_ALGO_NAME: &str = "ECDH+prime256v1-CEUM";
 pub const RSA_SIGNATURE_ALGO_NAME: &[u8] = b"RSASSA-PSS-SHA256";
 pub const ECDSA_SIGNATURE_ALGO_NAME: &[u8] = b"ECDSA-SHA256";
 
+// The name of an algorithm as a peer gives it: CycloneDDS ends it with a zero.
+pub(crate) fn algorithm_name(given: &[u8]) -> &[u8] {
+  given.strip_suffix(b"\0").unwrap_or(given)
+}
+
 // Recognize standard string constatns and convert to
 // corresponging algorithm identifiers in ring library.
 pub(crate) fn parse_signature_algo_name_to_ring(
   algo_name: &[u8],
 ) -> SecurityResult<&'static dyn ring::signature::VerificationAlgorithm> {
-  match algo_name {
+  match algorithm_name(algo_name) {
     RSA_SIGNATURE_ALGO_NAME => Err(create_security_error_and_log!("RSA is not supported")),
     ECDSA_SIGNATURE_ALGO_NAME => Ok(&ring::signature::ECDSA_P256_SHA256_ASN1),
     _other =>

@@ -38,6 +38,7 @@ from sctn_msgs.srv import ProposeHome, SetStep
 from sensor_msgs.msg import JointState
 from test_refusals import Cell
 from ur_msgs.msg import IOStates
+from whole_run import OBSERVATION_MAX_AGE_S, STATUS_MAX_AGE_S
 
 # The arm has moved when a joint is so much further [rad].
 MOVED_RAD = 0.02
@@ -224,7 +225,12 @@ class Bench:
 
     def start_executor(self) -> Process:
         """Starts an executor on its host."""
-        values = {"observation_needs_home": str(self.needs_home).lower(), "operators": f'["{NAME}"]'}
+        values: dict[str, object] = {
+            "observation_needs_home": str(self.needs_home).lower(),
+            "operators": f'["{NAME}"]',
+            "driver.status_max_age_s": STATUS_MAX_AGE_S,
+            "observation_max_age_s": OBSERVATION_MAX_AGE_S,
+        }
         if self.layout is Layout.CLOCK:
             values["use_sim_time"] = "true"
         return self.start("suction_executor", *arguments("suction_executor", **values), prefix=self.link.prefix if self.link else None)

@@ -26,6 +26,7 @@ from campaign_cell import (
     propose_home,
 )
 from sctn_msgs.msg import PickPlace, StepConfirmation, StepResult
+from whole_run import OBSERVATION_MAX_AGE_S
 
 # A stop reaches the executor, its cancel the driver, and the arm brakes, which takes 0.12 s.
 REST_S = 0.3
@@ -49,8 +50,8 @@ NEAR_HOME_RAD = 0.2
 EXIT_S = 10.0
 # A recorder cannot write more to one file [blocks of 512 bytes].
 DISK_BLOCKS = 400
-# observation_max_age_s of config/hardware/realistic.yaml, and some more [s].
-OLD_S = 3.3
+# A view is older then than may be [s].
+OLD_S = OBSERVATION_MAX_AGE_S + 0.3
 
 Fault = Callable[[Bench], None]
 

@@ -20,7 +20,7 @@ from sctn_msgs.msg import Heightmap, PickPlace, StepConfirmation, StepResult
 from sctn_msgs.srv import ProposeHome
 from test_refusals import Cell
 from ur_msgs.msg import IOStates
-from whole_run import parameters
+from whole_run import OBSERVATION_MAX_AGE_S, parameters
 
 # Problems, signs of contact, and how many motions each may take: every step may be tried again a few times, the policy is learned.
 WHOLE_RUNS = {("placing", "until_action"): 3 * 9, ("stacking", "until_action"): 3 * 6, ("placing", "height"): 3 * 9}
@@ -197,8 +197,8 @@ def test_a_heightmap_with_the_arm_in_view_is_no_ground_to_move_on(cell: Cell) ->
 
 def test_an_approval_on_a_view_that_is_old_moves_nothing(cell: Cell) -> None:
     proposal = propose(cell)
-    # Fusion or cameras have died: config/hardware/realistic.yaml allows 3 s.
-    cell.operator.spin(3.2)
+    # Fusion or cameras have died.
+    cell.operator.spin(OBSERVATION_MAX_AGE_S + 0.2)
     refused = cell.decide(proposal.id)
     assert refused.outcome == StepResult.REFUSED
     assert "observation_max_age_s" in refused.reason, refused.reason

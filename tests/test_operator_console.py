@@ -853,7 +853,7 @@ def test_a_program_approves_a_step_and_is_refused_what_is_stale(start, decided) 
     assert done.returncode == 0, done.stderr
     assert done.stdout.endswith("all steps are done\n")
     assert console.state()["phase"] == "complete"
-    assert {one.operator_name for one in decided()} == {"a program", "operator_console.py"}
+    until(lambda: {one.operator_name for one in decided()} == {"a program", "operator_console.py"}, "decisions of both programs", 30.0)
 
 
 def test_the_page_is_served_with_tls_and_another_address_needs_it(start, tmp_path: pathlib.Path) -> None:

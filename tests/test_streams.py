@@ -38,9 +38,8 @@ def test_heightmaps_reach_rclpy_whole_and_soon() -> None:
 def test_cameras_on_fast_dds_lose_no_image(start, profile: bool, rate_hz: int, seconds: int) -> None:
     """Three RGB-D cameras of rclpy, a process each, send images of 0.9 and 1.2 MB at one moment; Fast DDS sends them in bursts."""
     sets = rate_hz * seconds + 1
-    # Images are best effort, and 330 MB/s leave a busy machine no time to ask again for what its sockets lost: at 30 Hz the best
-    # of three runs counts.
-    for _ in range(3 if rate_hz == 30 else 1):
+    # Images are best effort, and a busy machine has no time to ask again for what its sockets lost: the best of three runs counts.
+    for _ in range(3):
         lost = lost_of_cameras(start, profile, rate_hz, seconds)
         if not lost:
             return

@@ -31,6 +31,9 @@ from sctn_msgs.msg import StepConfirmation, StepResult
 REALISTIC = REPOSITORY / "config/hardware/realistic.yaml"
 PERTURBATION = REPOSITORY / "config/perturbations/realsense.yaml"
 CHECKPOINTS = REPOSITORY / "config/checkpoints"
+# How old joint states and heightmaps may be [s]. Processes here wait for a processor, as those of a robot's computer do not: a pause of the
+# simulation is no driver that is lost, and one of the fusion no dead camera.
+STATUS_MAX_AGE_S, OBSERVATION_MAX_AGE_S = 1.0, 8.0
 # What ends a run.
 BROKEN_OFF = (StepResult.FAULT, StepResult.STOPPED, StepResult.REFUSED)
 
@@ -38,6 +41,8 @@ BROKEN_OFF = (StepResult.FAULT, StepResult.STOPPED, StepResult.REFUSED)
 def parameters(node: str, **values: object) -> list[object]:
     """The arguments of a node of the realistic cell."""
     arguments: list[object] = ["--ros-args", "--params-file", REPOSITORY / f"config/{node}.yaml", "--params-file", REALISTIC]
+    if node == "suction_executor":
+        values = {"driver__status_max_age_s": STATUS_MAX_AGE_S, "observation_max_age_s": OBSERVATION_MAX_AGE_S, **values}
     for name, value in values.items():
         arguments += ["-p", f"{name.replace('__', '.')}:={value}"]
     return arguments
@@ -102,8 +107,7 @@ def main() -> None:
         start("camera_fusion", *parameters("camera_fusion"))
         start("goal_oracle", *parameters("goal_oracle", demonstration=demonstration))
         start("gctn_policy", *parameters("gctn_policy", checkpoint=checkpoint))
-        # Processes here wait for a processor, as those of a robot's computer do not: a pause of the simulation is no driver that is lost.
-        start("suction_executor", *parameters("suction_executor", driver__status_max_age_s=1.0, **sign))
+        start("suction_executor", *parameters("suction_executor", **sign))
         operator.listeners = 3
         begin = time.monotonic()
         try:

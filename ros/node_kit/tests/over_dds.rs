@@ -339,6 +339,48 @@ async fn services_answer_two_clients() {
 }
 
 #[tokio::test(flavor = "multi_thread")]
+async fn a_new_subscription_gets_nothing_that_came_before_it() {
+    let network = Network::unused().unwrap();
+    let (speaking, hearing) = (Context::new(network), Context::new(network));
+    let speaker = node(&speaking, "speaker", "");
+    let hearer = node(&hearing, "hearer", "");
+    let publisher = speaker
+        .publisher::<Float64>("approvals", Qos::Event)
+        .unwrap();
+    let say = |data: f64| publisher.publish(Float64 { data });
+    let subscribe = || {
+        hearer
+            .subscription::<Float64>("approvals", Qos::Event)
+            .unwrap()
+    };
+    let other = hearer
+        .subscription::<Float64>("approvals", Qos::Event)
+        .unwrap();
+    let mut first = subscribe();
+    let graph = speaker.graph();
+    assert!(graph.wait_for_subscription("/approvals", LIMIT).await);
+    timeout(LIMIT, async {
+        say(1.0);
+        while first.recv().await.data != 1.0 {}
+    })
+    .await
+    .unwrap();
+    drop(first);
+    let mut second = subscribe();
+    // Both ends may still be discovering each other.
+    let heard = timeout(LIMIT, async {
+        loop {
+            say(2.0);
+            if let Ok(heard) = timeout(Duration::from_millis(200), second.recv()).await {
+                return heard.data;
+            }
+        }
+    });
+    assert_eq!(heard.await.unwrap(), 2.0);
+    drop(other);
+}
+
+#[tokio::test(flavor = "multi_thread")]
 async fn a_client_that_cannot_hear_answers_delays_no_other_client() {
     const UNHEARD: usize = 30;
     let network = Network::unused().unwrap();

@@ -308,6 +308,16 @@ impl TopicCache {
     gave_up
   }
 
+  // Where a reader begins that is to get nothing of what is here already: the
+  // last sequence number of each writer, and the last time.
+  pub fn end(&self) -> (BTreeMap<GUID, SequenceNumber>, Timestamp) {
+    let last = |(writer, sn_map): (&GUID, &BTreeMap<SequenceNumber, Timestamp>)| {
+      sn_map.keys().next_back().map(|sn| (*writer, *sn))
+    };
+    let last_sn = self.sequence_numbers.iter().filter_map(last).collect();
+    (last_sn, self.last_added_instant)
+  }
+
   pub fn get_change(&self, instant: &Timestamp) -> Option<&CacheChange> {
     self.changes.get(instant)
   }

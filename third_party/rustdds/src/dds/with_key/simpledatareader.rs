@@ -58,10 +58,17 @@ pub(crate) struct ReadState<K: Key> {
 }
 
 impl<K: Key> ReadState<K> {
-  fn new() -> Self {
+  // All readers of a topic in a participant share its cache. What another one has
+  // received before is no news for a new reader without durability.
+  fn new(topic_cache: &TopicCache, is_volatile: bool) -> Self {
+    let (last_read_sn, latest_instant) = if is_volatile {
+      topic_cache.end()
+    } else {
+      (BTreeMap::new(), Timestamp::ZERO)
+    };
     ReadState {
-      latest_instant: Timestamp::ZERO,
-      last_read_sn: BTreeMap::new(),
+      latest_instant,
+      last_read_sn,
       hash_to_key_map: BTreeMap::<KeyHash, K>::new(),
     }
   }
@@ -179,13 +186,15 @@ where
       });
     }
 
+    let read_state = ReadState::new(&topic_cache.lock().unwrap(), qos_policy.is_volatile());
+
     Ok(Self {
       my_subscriber: subscriber,
       qos_policy,
       my_guid,
       notification_receiver: Mutex::new(notification_receiver),
       topic_cache,
-      read_state: Mutex::new(ReadState::new()),
+      read_state: Mutex::new(read_state),
       my_topic: topic,
       deserializer_type: PhantomData,
       discovery_command,

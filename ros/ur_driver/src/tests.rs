@@ -464,10 +464,10 @@ async fn every_fault_of_the_robot_ends_a_motion_with_its_name() {
         ("protective_stop", "PROTECTIVE_STOP"),
         ("emergency_stop", "ROBOT_EMERGENCY_STOP"),
         ("program_stopped", "program is not running"),
-        ("driver_dead", "expected at most 0.3 s"),
+        ("driver_dead", "expected at most 1.0 s"),
     ] {
         let driver = DriverParameters {
-            status_max_age_s: 0.3,
+            status_max_age_s: 1.0,
             ..DriverParameters::default()
         };
         let hardware = [("braking_time_s", "0.1"), ("speed_scaling", "0.2")];

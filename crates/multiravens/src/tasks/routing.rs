@@ -192,7 +192,9 @@ impl Routing {
         let to_last = length(&taut);
         let last = taut[taut.len() - 1];
         let reach = Point2::new(rng.random_range(0.185..0.205), 0.0) - last;
-        let beads = ((to_last + reach.norm() + SLACK_M) / BeadChain::PITCH_M).ceil() as usize + 1;
+        let wanted = ((to_last + reach.norm() + SLACK_M) / BeadChain::PITCH_M).ceil() as usize + 1;
+        // Of one scene in 2,700 with three pegs the last bead would lie beside the footprint.
+        let beads = wanted.min(most_beads(start));
         let free = (beads - 1) as f64 * BeadChain::PITCH_M - to_last - SLACK_M;
         let end = last + reach.normalize() * free;
         let laid = match draws.other_start() {
@@ -237,9 +239,21 @@ fn length(points: &[Point2<f64>]) -> f64 {
         .sum()
 }
 
+/// Where a cable that is laid from its anchor reaches its start side.
+fn corner(start: Point2<f64>) -> Point2<f64> {
+    Point2::new(start.x + 0.05, START_Y_M)
+}
+
+/// How many beads of a cable that is laid as in [`lay`] are in the footprint, with a little room for the first steps at rest.
+fn most_beads(start: Point2<f64>) -> usize {
+    let corner = corner(start);
+    let along_x = FOOTPRINT_M.0 / 2.0 - 1e-4 - corner.x;
+    (((corner - start).norm() + along_x) / BeadChain::PITCH_M) as usize + 1
+}
+
 /// Beads at their pitch, from the anchor aslant to the cable's start side and on along x.
 fn lay(start: Point2<f64>, beads: usize) -> Vec<Point2<f64>> {
-    let corner = Point2::new(start.x + 0.05, START_Y_M);
+    let corner = corner(start);
     let slant = (corner - start).norm();
     let at = |index: usize| {
         let along = index as f64 * BeadChain::PITCH_M;

@@ -14,6 +14,8 @@ from sctn_msgs.msg import StepResult
 # Some of these episodes fail at a step and go on.
 FIRST_SEED = {"chaining": 10000, "routing": 10020}
 EPISODES = 10
+# A bead is to be set down between two pegs, 2.95 mm beside one: the gripper's margin is 3 mm.
+REFUSED = {"chaining": [], "routing": [10_038]}
 
 
 @pytest.mark.parametrize("problem", ["chaining", "routing"])
@@ -29,14 +31,20 @@ def test_an_episode_has_the_same_outcome_in_the_graph_as_in_the_evaluation(start
     def launch(episode: dict, domain: int) -> Process:
         return start("sctn", "launch", "--problem", problem, "--seed", episode["seed"], "--json", domain=domain)
 
+    refused = []
     graphs = [launch(*pair) for pair in zip(episodes[:2], domains, strict=True)]
     for number, episode in enumerate(episodes):
         graphs[number].wait(120.0)
         if number + 2 < EPISODES:
             graphs.append(launch(episodes[number + 2], domains[number % 2]))
+        # The executor refuses what brings the arm too near to something; the evaluation has no such rule.
+        if graphs[number].exit_code == 1 and "refusals in a row" in (log := graphs[number].log()) and "from the heightmap" in log:
+            refused.append(episode["seed"])
+            continue
         outcome = json.loads(graphs[number].output().splitlines()[-1])
         graph = (outcome["completed"], outcome["reward"], outcome["steps"])
         assert graph == (episode["completed"], pytest.approx(episode["reward"]), episode["steps"]), episode["seed"]
+    assert refused == REFUSED[problem]
 
 
 def test_a_pick_that_has_just_failed_is_not_proposed_again(start, tmp_path: pathlib.Path) -> None:

@@ -34,7 +34,7 @@ def test_an_episode_has_the_same_outcome_in_the_graph_as_in_the_evaluation(start
     refused = []
     graphs = [launch(*pair) for pair in zip(episodes[:2], domains, strict=True)]
     for number, episode in enumerate(episodes):
-        graphs[number].wait(120.0)
+        graphs[number].wait(240.0)
         if number + 2 < EPISODES:
             graphs.append(launch(episodes[number + 2], domains[number % 2]))
         # The executor refuses what brings the arm too near to something; the evaluation has no such rule.

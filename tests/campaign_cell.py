@@ -67,7 +67,7 @@ SILENT_S = 5.0
 LAST_MESSAGES_S = 0.2
 # A step is tried again so often where somebody was not heard in time, the driver by the executor or the executor by the watchdog, and
 # what is said then.
-ATTEMPTS = 3
+ATTEMPTS = 5
 UNHEARD = ("s old, expected at most", "were interrupted for more than", "ended as Canceled")
 # After a cancel the watchdog cancels everything for so long: insist_s of config/motion_watchdog.yaml.
 INSIST_S = 3.0

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import pathlib
+import tempfile
 from collections.abc import Callable, Iterator
 
 import pytest
@@ -17,6 +19,20 @@ os.environ["FASTRTPS_DEFAULT_PROFILES_FILE"] = str(REPOSITORY / "config/fastdds.
 from cell_operator import Operator
 
 Start = Callable[..., Process]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def processors(request: pytest.FixtureRequest) -> Iterator[None]:
+    """A module marked `alone` runs while no other module does, of this run of the tests or another of this machine."""
+    alone = request.node.get_closest_marker("alone") is not None
+    folder = pathlib.Path(tempfile.gettempdir())
+    # Who waits for the room holds the door: those who come later wait behind it.
+    door, room = (folder / f"sctn_tests_{os.getuid()}_{name}.lock" for name in ("door", "room"))
+    with room.open("ab") as room_lock:
+        with door.open("ab") as door_lock:
+            fcntl.flock(door_lock, fcntl.LOCK_EX)
+            fcntl.flock(room_lock, fcntl.LOCK_EX if alone else fcntl.LOCK_SH)
+        yield
 
 
 @pytest.fixture(scope="module")

@@ -10,6 +10,8 @@ import pytest
 from fault_monitor import ABORTED, CANCELED, SUCCEEDED, Kind, Monitor
 from processes import BINARIES, REPOSITORY
 
+pytestmark = pytest.mark.alone
+
 # Each takes some 11 s, a fifth of a core; `cargo xtask campaign` takes any number.
 FAULTS = 50
 CELLS = 4

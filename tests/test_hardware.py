@@ -69,7 +69,7 @@ def look_at(cell: Cell) -> Callable[[Heightmap], None]:
 
     def look(heightmap: Heightmap) -> None:
         heightmap.rgb = np.full(len(heightmap.rgb), 90, dtype=np.uint8)
-        heightmap.header.stamp = cell.operator.newest("joint_states").header.stamp
+        heightmap.header.stamp = cell.rest_state().header.stamp
 
     return look
 

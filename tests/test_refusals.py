@@ -20,6 +20,7 @@ from rclpy.duration import Duration
 from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
 from sctn_msgs.msg import Heightmap, PickPlace, PrimitiveSettings, StepConfirmation, StepResult
+from sensor_msgs.msg import JointState
 from std_msgs.msg import Header
 
 ROWS, COLS, PIXEL_SIZE_M = 320, 160, 0.003125
@@ -125,12 +126,14 @@ class Cell:
 
     def joints(self) -> np.ndarray:
         """Joint positions in the order of the message, no older than the executor's last word [rad]."""
-        return np.array(
-            self.operator.next(
-                "joint_states",
-                self.operator.count("joint_states"),
-                lambda state: nanoseconds(state.header.stamp) >= nanoseconds(self._last_word()),
-            ).position
+        return np.array(self.rest_state().position)
+
+    def rest_state(self) -> JointState:
+        """A new joint state, no older than the executor's last word: a busy machine hands over older ones after it."""
+        return self.operator.next(
+            "joint_states",
+            self.operator.count("joint_states"),
+            lambda state: nanoseconds(state.header.stamp) >= nanoseconds(self._last_word()),
         )
 
     def _last_word(self) -> Time:

@@ -27,7 +27,8 @@ class Transporter(nn.Module):
         layers = [nn.Conv2d(8, width, 5, STRIDE, 2), nn.ReLU()]
         for dilation in (1, 2, 4, 8, 1):
             layers += [nn.Conv2d(width, width, 3, 1, dilation, dilation), nn.ReLU()]
-        self.trunk = nn.Sequential(*layers)
+        # Without it the place logits, products of two features, grow while the pick learns, and either may stay at chance.
+        self.trunk = nn.Sequential(*layers, nn.GroupNorm(4, width))
         self.pick, self.query, self.key = (nn.Conv2d(width, size, 1) for size in (1, features, features))
 
     def forward(self, seen, pick=None):

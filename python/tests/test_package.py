@@ -16,7 +16,7 @@ import multiravens
 FOLDER = pathlib.Path(__file__).resolve().parents[1]
 
 
-def run(*arguments: str, timeout: float = 400.0) -> str:
+def run(*arguments: str, timeout: float = 1200.0) -> str:
     done = subprocess.run([sys.executable, *arguments], capture_output=True, text=True, cwd=FOLDER, timeout=timeout, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout

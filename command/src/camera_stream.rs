@@ -9,11 +9,12 @@ use msgs::diagnostic_msgs::DiagnosticArray;
 use msgs::sctn_msgs::Heightmap;
 use msgs::sensor_msgs::{CameraInfo, Image};
 use msgs::tf2_msgs::TFMessage;
-use node_kit::{Context, Network, NoParameters, Publisher, Qos, RosArguments, Subscription};
+use node_kit::{Context, Network, NoParameters, Publisher, Qos, RosArguments, Subscription, when};
 use serde::Serialize;
 use std::collections::BTreeMap;
 use std::process::{Child, Command, Stdio};
 use std::time::{Duration, Instant};
+use tokio::time::sleep_until;
 
 const RATE_HZ: f64 = 30.0;
 /// Its colour image has 1.04 MB, its depth image of 16UC1 0.69 MB.
@@ -218,7 +219,7 @@ async fn run(root: &Root, seconds: f64, frames: usize) -> Result<Figures> {
                     end = Some(Instant::now() + Duration::from_secs(2));
                 }
             }
-            () = until(end) => break,
+            () = when(end.map(|end: Instant| sleep_until(end.into()))) => break,
         }
         if latencies_s.len() as u64 == sets {
             break;
@@ -251,13 +252,6 @@ async fn run(root: &Root, seconds: f64, frames: usize) -> Result<Figures> {
         latency_p99_s: quantile(0.99),
         latency_max_s: quantile(1.0),
     })
-}
-
-async fn until(end: Option<Instant>) {
-    match end {
-        Some(end) => tokio::time::sleep_until(end.into()).await,
-        None => std::future::pending().await,
-    }
 }
 
 /// What the fusion says of its image topics in its next diagnostics.

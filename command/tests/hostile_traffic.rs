@@ -11,7 +11,11 @@ use node_kit::{
 };
 use rand::{Rng, RngExt, SeedableRng};
 use rand_chacha::ChaCha8Rng;
-use rustdds::{DomainParticipantBuilder, QosPolicies, QosPolicyBuilder, TopicKind, policy};
+use rustdds::discovery::SubscriptionBuiltinTopicData;
+use rustdds::{
+    DataWriterStatus, DomainParticipant, DomainParticipantBuilder, QosPolicies, QosPolicyBuilder,
+    StatusEvented as _, TopicKind, policy,
+};
 use std::collections::BTreeMap;
 use std::net::{IpAddr, Ipv4Addr};
 use std::path::{Path, PathBuf};
@@ -24,6 +28,11 @@ const DURATION: Duration = Duration::from_secs(60);
 /// Messages sent at a time, then a pause: 1 kHz, all to one reader.
 const VOLLEY: usize = 200;
 const PAUSE: Duration = Duration::from_millis(200);
+/// More topics than these have readers.
+const LEAST_READERS: usize = 40;
+/// Nothing new for so long: discovery is over.
+const QUIET: Duration = Duration::from_secs(1);
+const POLL: Duration = Duration::from_millis(10);
 /// More memory than this, beyond what a node needed before, is a leak.
 const MOST_GROWTH_MB: u64 = 150;
 
@@ -137,6 +146,31 @@ fn garbage(random: &mut ChaCha8Rng) -> Vec<u8> {
     bytes
 }
 
+/// A reader of each topic of the graph, once none has been new for some time: nothing says that all are discovered.
+fn discovered(
+    participant: &DomainParticipant,
+) -> Result<BTreeMap<String, SubscriptionBuiltinTopicData>> {
+    let readers = || -> BTreeMap<_, _> {
+        let readers = participant.discovered_readers().into_iter();
+        readers
+            .map(|reader| reader.subscription_topic_data)
+            .filter(|reader| !reader.topic_name().starts_with("DCPS"))
+            .map(|reader| (reader.topic_name().clone(), reader))
+            .collect()
+    };
+    let begin = Instant::now();
+    let (mut known, mut since) = (readers(), begin);
+    while known.len() <= LEAST_READERS || since.elapsed() < QUIET {
+        ensure!(begin.elapsed() < PATIENCE, "{} readers", known.len());
+        std::thread::sleep(POLL);
+        let found = readers();
+        if found.len() != known.len() {
+            (known, since) = (found, Instant::now());
+        }
+    }
+    Ok(known)
+}
+
 /// Sends garbage to every reader of the graph in turn; how many messages to how many readers.
 fn attack(
     network: Network,
@@ -147,14 +181,7 @@ fn attack(
         .with_only_networks([IpAddr::V4(Ipv4Addr::LOCALHOST)])
         .build()
         .map_err(|error| anyhow::anyhow!("{error:?}"))?;
-    std::thread::sleep(Duration::from_secs(3));
-    let readers: BTreeMap<_, _> = participant
-        .discovered_readers()
-        .into_iter()
-        .map(|reader| reader.subscription_topic_data)
-        .filter(|reader| !reader.topic_name().starts_with("DCPS"))
-        .map(|reader| (reader.topic_name().clone(), reader))
-        .collect();
+    let readers = discovered(&participant)?;
     let mut writers = Vec::new();
     for (name, reader) in &readers {
         let qos = offer(&reader.qos());
@@ -171,7 +198,16 @@ fn attack(
             });
         writers.push(made.map_err(|error| anyhow::anyhow!("{name}: {error:?}"))?);
     }
-    std::thread::sleep(Duration::from_secs(1));
+    let end = Instant::now() + PATIENCE;
+    for (writer, topic) in writers.iter().zip(readers.keys()) {
+        while !writer
+            .try_recv_status()
+            .is_some_and(|status| matches!(status, DataWriterStatus::PublicationMatched { .. }))
+        {
+            ensure!(Instant::now() < end, "no reader of {topic} is matched");
+            std::thread::sleep(POLL);
+        }
+    }
     let mut random = ChaCha8Rng::seed_from_u64(1);
     let mut sent = 0;
     let end = Instant::now() + duration;
@@ -328,7 +364,7 @@ async fn hostile_traffic_on_every_topic_and_service_ends_no_node() -> Result<()>
             );
         }
         ensure!(
-            sent > 1_000 && readers > 40,
+            sent > 1_000 && readers > LEAST_READERS,
             "{sent} messages to {readers} readers"
         );
         Ok(nodes)

@@ -5,12 +5,13 @@ use anyhow::{Context as _, Result, bail};
 use bag_transport::{Progress, Recorder, RecorderOptions, Selection};
 use bags::WriteOptions;
 use clap::Args;
-use node_kit::{plain_node, wait_for_end};
+use node_kit::{plain_node, wait_for_end, when};
 use regex::RegexSet;
 use std::io::{IsTerminal, Write};
 use std::path::{Path, PathBuf};
 use std::process::ExitCode;
 use std::time::{Duration, Instant};
+use tokio::time::sleep;
 
 /// How often progress is shown: to a person, and in a log.
 const SHOW_EVERY: Duration = Duration::from_secs(1);
@@ -145,7 +146,7 @@ impl Record {
                     ended?;
                     break;
                 }
-                () = after(limit.map(|limit| limit.saturating_sub(started.elapsed()))) => break,
+                () = when(limit.map(|limit| sleep(limit.saturating_sub(started.elapsed())))) => break,
             }
         }
         show.clear();
@@ -184,13 +185,6 @@ impl Record {
         } else {
             ExitCode::from(DAMAGED)
         })
-    }
-}
-
-async fn after(time: Option<Duration>) {
-    match time {
-        Some(time) => tokio::time::sleep(time).await,
-        None => std::future::pending().await,
     }
 }
 

@@ -15,7 +15,7 @@ use heightmap::Heightmap;
 use msgs::convert::{self, heightmap_from_msg};
 use msgs::sctn_msgs::{ConfirmationRefused, Goal, PickPlace, Reward, StepConfirmation, StepResult};
 use multiravens::{Environment, EpisodeSeed, Problem};
-use node_kit::{Node, Qos, ns_from_stamp, plain_node, wait_for_end};
+use node_kit::{Node, Qos, ns_from_stamp, plain_node, wait_for_end, when};
 use operator::{OperatorKind, Prompt, RequireApproval, confirmation, described};
 use recording::{LAST_HEIGHTMAP, LAST_WORDS, LAST_WORDS_ELSEWHERE, RunRecorder};
 use serde::Serialize;
@@ -302,7 +302,7 @@ impl Launch {
             tokio::select! {
                 ended = desk.work(self.operator, max_steps) => ended,
                 error = graph.failure() => Err(error),
-                () = recording_ended(recorder.as_ref()) => Err(anyhow::anyhow!("the recording ended before the run")),
+                () = when(recorder.as_ref().map(RunRecorder::ended)) => Err(anyhow::anyhow!("the recording ended before the run")),
             }
         };
         let ended = tokio::select! {
@@ -349,14 +349,6 @@ impl Launch {
             steps,
             bag,
         })
-    }
-}
-
-/// Waits until the recording has ended by itself; for ever without one.
-async fn recording_ended(recorder: Option<&RunRecorder>) {
-    match recorder {
-        Some(recorder) => recorder.ended().await,
-        None => std::future::pending().await,
     }
 }
 

@@ -190,6 +190,9 @@ const AT_A_TIME: usize = 3 * 64;
 
 /// Multiplies the channels by their gains, and gives each value noise of its own.
 pub(crate) fn color(gains: [f32; 3], noise: f32, rng: &mut ChaCha8Rng, rgb: &mut [u8]) {
+    if gains == [1.0; 3] && noise <= 0.0 {
+        return;
+    }
     let gains: [f32; AT_A_TIME] = std::array::from_fn(|index| gains[index % 3]);
     let mut errors = [0.0; AT_A_TIME];
     for values in rgb.chunks_mut(AT_A_TIME) {

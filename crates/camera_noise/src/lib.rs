@@ -7,7 +7,7 @@ mod rig;
 pub use model::{
     Clutter, Color, Depth, Edges, Extrinsics, Holes, Light, Perturbation, PerturbationError,
 };
-pub use rig::{ClutterItem, Rig};
+pub use rig::{ClutterItem, DepthSteps, Rig};
 
 /// The example of the README is run as a test.
 #[cfg(doctest)]

@@ -34,6 +34,10 @@ pub struct Rig {
     session: u64,
 }
 
+/// Where the depths of an image have steps: the same in all images of a camera while nothing moves.
+#[derive(Clone, Debug, Default)]
+pub struct DepthSteps(Vec<(usize, f32, f32)>);
+
 #[derive(Clone, Debug)]
 struct DrawnCamera {
     /// By how much the calibration is wrong, in the camera's own frame.
@@ -139,13 +143,32 @@ impl Rig {
         rgb: &mut [u8],
         depth_m: &mut [f32],
     ) {
+        let steps = self.depth_steps(intrinsics, depth_m);
+        self.apply_with_steps(camera, intrinsics, frame, &steps, rgb, depth_m);
+    }
+
+    /// The steps of an image that was not changed yet.
+    pub fn depth_steps(&self, intrinsics: &Intrinsics, depth_m: &[f32]) -> DepthSteps {
+        let (width, height) = (intrinsics.width, intrinsics.height);
+        DepthSteps(image::steps(&self.model.edges, width, height, depth_m))
+    }
+
+    /// As [`Self::apply`], where the steps of the image are known.
+    pub fn apply_with_steps(
+        &self,
+        camera: usize,
+        intrinsics: &Intrinsics,
+        frame: u64,
+        steps: &DepthSteps,
+        rgb: &mut [u8],
+        depth_m: &mut [f32],
+    ) {
         let (width, height) = (intrinsics.width, intrinsics.height);
         let of = |index: u64| {
             let image = index * self.cameras.len() as u64 + camera as u64;
             stream(self.seed, self.session, FIRST_IMAGE + image)
         };
         let mut rng = of(1 + frame);
-        let edges = image::steps(&self.model.edges, width, height, depth_m);
         let stereo = StereoCamera::new(&self.model.depth);
         if self.model.depth.disparity_noise_px > 0.0 {
             let Depth {
@@ -173,7 +196,7 @@ impl Rig {
             hole_share,
             ..
         } = self.model.edges;
-        for (index, near_m, far_m) in edges {
+        for &(index, near_m, far_m) in &steps.0 {
             let chance: f64 = rng.random_range(0.0..1.0);
             let between: f32 = rng.random_range(0.0..1.0);
             if chance < hole_share {

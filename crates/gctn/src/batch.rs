@@ -1,10 +1,9 @@
 //! The part of a gradient step that needs no weights.
 
 use rand_chacha::{ChaCha8Rng, rand_core::SeedableRng};
-use tch::Tensor;
 
 use crate::augment::Warp;
-use crate::input::{Encoding, Label, encode, tensor};
+use crate::input::{Encoding, Label, encode};
 use crate::{Error, NetworkConfig, Sample, TrainingConfig};
 
 /// The samples of one gradient step, augmented and encoded as the network reads them.
@@ -12,8 +11,9 @@ use crate::{Error, NetworkConfig, Sample, TrainingConfig};
 pub struct Batch {
     /// Gradient steps done before this one.
     pub(crate) step: u64,
-    /// N x channels x rows x cols, in the processor's memory.
-    pub(crate) input: Tensor,
+    /// N x rows x cols x channels. No tensor yet: libtorch fills a new one on as many threads as it computes with, beside those of the trainer
+    /// where the batch is made on another thread.
+    pub(crate) encoded: Vec<f32>,
     pub(crate) labels: Vec<Label>,
     /// The step's random numbers after the augmentation.
     pub(crate) rng: ChaCha8Rng,
@@ -88,10 +88,9 @@ impl BatchMaker {
             encode(encoding, sample.observation, sample.goal, &warp, image);
             labels.push(label.warped(&warp, network));
         }
-        let input = tensor(encoding, [network.rows, network.cols], &encoded);
         Ok(Batch {
             step,
-            input,
+            encoded,
             labels,
             rng,
         })

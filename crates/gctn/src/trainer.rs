@@ -7,7 +7,7 @@ use tch::{Kind, Tensor};
 use crate::batch::{Batch, BatchMaker};
 use crate::candidates::{candidate_loss, turn_shapes};
 use crate::checkpoint::{self, File};
-use crate::input::Label;
+use crate::input::{self, Label};
 use crate::losses::{done_loss, first_place_loss, pick_loss, place_loss};
 use crate::network::{Builder, Features, Model, multiplications};
 use crate::optimiser::{self, AdamW, Rate};
@@ -197,11 +197,14 @@ impl Trainer {
         crate::apply_threads();
         let network = &self.model.config;
         let Batch {
-            input,
+            encoded,
             labels,
             mut rng,
             ..
         } = batch;
+        let size = [network.rows, network.cols];
+        let input = input::tensor(self.model.encoding(), size, &encoded);
+        drop(encoded);
         self.model.parameters.cast();
         let features = self.model.forward(&input.to_device(self.device));
         let (grid, sigma) = (&self.model.grid, self.config.label_sigma_cells);

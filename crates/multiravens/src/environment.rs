@@ -5,7 +5,7 @@ use crate::problem::Problem;
 use crate::render::{LIGHT, RenderError, RgbdImage};
 use crate::seed::{Draws, EpisodeSeed, stream};
 use crate::tasks::{Care, Demonstrator, Move, ParameterError, Task};
-use camera_noise::{ClutterItem, Perturbation, Rig};
+use camera_noise::{ClutterItem, DepthSteps, Perturbation, Rig};
 use heightmap::{
     Camera, Fusion, FusionError, Heightmap, StillFusion, StillSettings, View, Workspace,
 };
@@ -59,10 +59,19 @@ struct Perturbed {
 }
 
 impl Perturbed {
+    /// Where the depths of clean views have steps.
+    fn depth_steps(&self, views: &[View<'_>]) -> Vec<DepthSteps> {
+        let steps = |view: &View<'_>| {
+            let intrinsics = &view.camera.intrinsics;
+            self.rig.depth_steps(intrinsics, view.depth_m)
+        };
+        views.iter().map(steps).collect()
+    }
+
     /// The images that the cameras take of clean views, each with the camera as the fusion believes it to stand.
-    fn take(&mut self, views: &[View<'_>]) -> Vec<(Camera, RgbdImage)> {
+    fn take(&mut self, views: &[View<'_>], steps: &[DepthSteps]) -> Vec<(Camera, RgbdImage)> {
         let mut images = Vec::new();
-        for (index, view) in views.iter().enumerate() {
+        for (index, (view, steps)) in views.iter().zip(steps).enumerate() {
             if self.rig.is_missing(index) {
                 continue;
             }
@@ -71,10 +80,11 @@ impl Perturbed {
                 depth_m: view.depth_m.to_vec(),
             };
             let intrinsics = &view.camera.intrinsics;
-            self.rig.apply(
+            self.rig.apply_with_steps(
                 index,
                 intrinsics,
                 self.frame,
+                steps,
                 &mut image.rgb,
                 &mut image.depth_m,
             );
@@ -320,8 +330,9 @@ impl Environment {
             return Ok(&self.heightmap);
         };
         perturbed.fusion.forget();
+        let steps = perturbed.depth_steps(&views);
         for _ in 0..perturbed.model.frames {
-            let images = perturbed.take(&views);
+            let images = perturbed.take(&views, &steps);
             let taken: Vec<View<'_>> = images.iter().map(|(c, i)| i.view(c)).collect();
             perturbed.fusion.push(&taken, &Workspace::RAVENS)?;
         }

@@ -65,8 +65,8 @@ mod tests {
     use ur5::{JointTrajectory, Joints};
 
     use super::*;
+    use crate::fixtures::{proposal, reading, rehearsals};
     use crate::planned::DryRun;
-    use crate::rehearsals::tests::{proposal, reading, rehearsals};
 
     const ID: ProposalId = ProposalId(7);
 

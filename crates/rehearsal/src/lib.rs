@@ -1,6 +1,8 @@
 #![doc = include_str!("../README.md")]
 
 mod carry_out;
+#[cfg(test)]
+mod fixtures;
 mod planned;
 mod rehearsals;
 mod robot_now;

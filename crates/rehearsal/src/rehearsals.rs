@@ -206,66 +206,15 @@ impl<C> Rehearsals<C> {
 }
 
 #[cfg(test)]
-pub(crate) mod tests {
-    use collision::Margins;
+mod tests {
     use heightmap::Workspace;
-    use nalgebra::{Isometry2, Vector2};
-    use pick_place::{PickPlace, PrimitiveSettings};
     use step_protocol::{ProposalId, RefusalReason};
     use ur5::WorkCell;
 
     use super::*;
+    use crate::fixtures::{proposal, reading, rehearsals};
 
     const ID: ProposalId = ProposalId(7);
-
-    /// Nothing was seen yet. Calls are numbers.
-    pub(crate) fn rehearsals() -> Rehearsals<u32> {
-        let cell = WorkCell::builtin().unwrap();
-        let checker = CollisionChecker::new(&cell, Margins::default()).unwrap();
-        Rehearsals::new(RehearsalRules {
-            arm: cell.arm,
-            checker: Arc::new(checker),
-            needs_home: false,
-            observation_max_age: Duration::from_secs(10),
-            contact: ContactSettings::default(),
-            sign: ContactSign::UntilAction,
-            changes: ChangeRules::default(),
-        })
-    }
-
-    /// Of an arm at home that holds nothing.
-    pub(crate) fn reading() -> Reading {
-        Reading {
-            joints_rad: Some(WorkCell::builtin().unwrap().arm.home),
-            holds: Some(false),
-            publishers: 1,
-            ..Reading::default()
-        }
-    }
-
-    pub(crate) fn proposal(id: ProposalId) -> Proposal {
-        let pose = |y_m| Isometry2::new(Vector2::new(0.5, y_m), 0.0);
-        Proposal {
-            id,
-            frame: "world".into(),
-            stamp: Duration::ZERO,
-            problem: "placing".into(),
-            step: 1,
-            attempt: 0,
-            module: "placing".into(),
-            action: PickPlace {
-                pick: pose(0.1),
-                place: pose(-0.1),
-            },
-            settings: PrimitiveSettings::RIGID,
-            pick_score: 1.0,
-            place_score: 1.0,
-            success_probability: None,
-            done_probability: None,
-            checkpoint: String::new(),
-            author: "test".into(),
-        }
-    }
 
     fn table() -> Arc<Heightmap> {
         Arc::new(Heightmap::new(Workspace::RAVENS))

@@ -391,32 +391,9 @@ impl RobotNow {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::fixtures::{proposal_at, reading, rehearsals};
     use nalgebra::Vector2;
     use ur5::WorkCell;
-
-    fn proposal(x_m: f64) -> Proposal {
-        let pose = |y_m| Isometry2::new(Vector2::new(x_m, y_m), 0.0);
-        Proposal {
-            id: ProposalId(1),
-            frame: "world".into(),
-            stamp: Duration::ZERO,
-            problem: "placing".into(),
-            step: 1,
-            attempt: 0,
-            module: "placing".into(),
-            action: PickPlace {
-                pick: pose(0.1),
-                place: pose(-0.1),
-            },
-            settings: PrimitiveSettings::RIGID,
-            pick_score: 1.0,
-            place_score: 1.0,
-            success_probability: None,
-            done_probability: None,
-            checkpoint: String::new(),
-            author: "test".into(),
-        }
-    }
 
     fn text(cannot: CannotBegin) -> String {
         match cannot {
@@ -456,8 +433,8 @@ mod tests {
             ..robot_at(0.0, 0.3)
         };
         assert_eq!(RobotState::obstacle(&robot), None);
-        planned(&robot, &proposal(0.5)).unwrap();
-        let motion = robot.dry_run(&proposal(0.5)).unwrap();
+        planned(&robot, &proposal_at(0.5)).unwrap();
+        let motion = robot.dry_run(&proposal_at(0.5)).unwrap();
         let points = motion.points();
         assert!(points.len() > 100, "{}", points.len());
         assert!(points.is_sorted_by(|a, b| a.time < b.time));
@@ -471,22 +448,22 @@ mod tests {
         for pair in points.windows(2) {
             assert!((pair[0].positions_rad - pair[1].positions_rad).amax() < 0.2);
         }
-        let reason = planned(&robot, &proposal(2.0)).unwrap_err();
+        let reason = planned(&robot, &proposal_at(2.0)).unwrap_err();
         assert!(
             reason.contains("pick") && !reason.contains('\n'),
             "{reason}"
         );
         robot.holds = Some(true);
-        let reason = planned(&robot, &proposal(0.5)).unwrap_err();
+        let reason = planned(&robot, &proposal_at(0.5)).unwrap_err();
         assert!(reason.contains("already holds"), "{reason}");
         robot.holds = Some(false);
-        planned(&robot, &proposal(0.5)).unwrap();
+        planned(&robot, &proposal_at(0.5)).unwrap();
         robot.unseen = true;
-        let reason = planned(&robot, &proposal(0.5)).unwrap_err();
+        let reason = planned(&robot, &proposal_at(0.5)).unwrap_err();
         assert!(reason.contains("nobody publishes heightmaps"), "{reason}");
         robot.unseen = false;
         robot.time = Duration::from_secs(11);
-        let reason = planned(&robot, &proposal(0.5)).unwrap_err();
+        let reason = planned(&robot, &proposal_at(0.5)).unwrap_err();
         assert!(reason.contains("11.0 s old"), "{reason}");
         robot.time = Duration::ZERO;
         robot.needs_home = true;
@@ -500,7 +477,7 @@ mod tests {
         let in_view = |robot: &RobotNow, stamp_s| {
             let proposal = Proposal {
                 stamp: Duration::from_secs(stamp_s),
-                ..proposal(0.5)
+                ..proposal_at(0.5)
             };
             let planned = planned(robot, &proposal);
             planned.is_err_and(|reason| reason.contains("call it home"))
@@ -517,16 +494,11 @@ mod tests {
         robot.seen = Some((heightmap, Duration::from_secs(2)));
         assert!(in_view(&robot, 3));
         robot.seen = None;
-        let reason = planned(&robot, &proposal(0.5)).unwrap_err();
+        let reason = planned(&robot, &proposal_at(0.5)).unwrap_err();
         assert!(reason.contains("no heightmap"), "{reason}");
         robot.obstacle = Some("controller `x` is inactive".into());
         let obstacle = RobotState::obstacle(&robot).map(String::from);
         assert_eq!(obstacle, robot.obstacle);
-    }
-
-    fn checker() -> Arc<CollisionChecker> {
-        let cell = WorkCell::builtin().unwrap();
-        Arc::new(CollisionChecker::new(&cell, collision::Margins::default()).unwrap())
     }
 
     /// A robot whose tip stands over (0.5, y) at a height.
@@ -535,24 +507,8 @@ mod tests {
         let over = Isometry2::new(Vector2::new(0.5, y_m), 0.0);
         let joints = arm.solve(&Arm::tip_down(&over, height_m), &arm.ready);
         RobotNow {
-            arm,
-            obstacle: None,
             joints_rad: Some(joints.unwrap()),
-            holds: Some(false),
-            at_home: AtHome::default(),
-            unseen: false,
-            needs_home: false,
-            time: Duration::ZERO,
-            seen: None,
-            observation_max_age: Duration::from_secs(10),
-            contact: ContactSettings::default(),
-            sign: ContactSign::UntilAction,
-            checker: checker(),
-            without_arm: None,
-            picked: None,
-            changes: ChangeRules::default(),
-            rehearsed: None,
-            rehearsed_recovery: None,
+            ..rehearsals().robot(reading())
         }
     }
 
@@ -675,7 +631,7 @@ mod tests {
                 lift_m: 0.45,
                 ..PrimitiveSettings::RIGID
             },
-            ..proposal(0.5)
+            ..proposal_at(0.5)
         };
         planned(&robot, &proposal).unwrap();
         let arm = &robot.arm;
@@ -707,7 +663,7 @@ mod tests {
     #[test]
     fn a_rehearsal_holds_while_the_arm_stands_there_and_the_view_is_unchanged() {
         let mut robot = robot_at(0.35, 0.2);
-        let proposal = proposal(0.5);
+        let proposal = proposal_at(0.5);
         let seen = table_with_a_wall();
         let is_due = |robot: &RobotNow| {
             let checked = robot.check_motion(&proposal);

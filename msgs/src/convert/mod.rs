@@ -21,7 +21,7 @@ pub use heightmap::{header, heightmap_from_msg, heightmap_to_msg};
 pub use motion::{
     JointReading, isometry_from_msg, isometry_to_msg, joint_reading_from_msg, joint_state_to_msg,
     joint_trajectory_from_msg, joint_trajectory_to_msg, joints_from_msg, outcome_from_msg,
-    outcome_to_msg, phase_to_msg, pick_place_from_msg, pose2d_from_msg, pose2d_to_msg,
+    outcome_to_msg, phase_to_msg, pick_place_from_msg, pin_level, pose2d_from_msg, pose2d_to_msg,
     settings_from_msg, settings_to_msg, trajectory_points_to_msg,
 };
 pub use preview::{compressed_preview, grid_map, points, preview_image};

@@ -2,7 +2,7 @@
 
 use super::error::{all_finite, finite, positive, size, unexpected};
 use super::{ConvertError, duration_from_msg, duration_to_msg, time_from_msg};
-use crate::{geometry_msgs, sctn_msgs, sensor_msgs, std_msgs, trajectory_msgs};
+use crate::{geometry_msgs, sctn_msgs, sensor_msgs, std_msgs, trajectory_msgs, ur_msgs};
 use ::pick_place::{Outcome, Phase, PickPlace, PrimitiveSettings};
 use nalgebra::{Isometry2, Isometry3, Quaternion, Translation3, Unit, UnitQuaternion};
 use std::f64::consts::TAU;
@@ -205,6 +205,12 @@ pub fn joint_reading_from_msg(
     })
 }
 
+/// The level of a digital pin, where the message says it.
+pub fn pin_level(states: &[ur_msgs::Digital], pin: u8) -> Option<bool> {
+    let found = states.iter().find(|state| state.pin == pin);
+    found.map(|state| state.state)
+}
+
 /// Positions and velocities of the joints.
 pub fn joint_state_to_msg(
     header: std_msgs::Header,
@@ -298,6 +304,15 @@ mod tests {
     use proptest::prelude::*;
 
     const NAMES: [&str; 6] = ["a", "b", "c", "d", "e", "f"];
+
+    #[test]
+    fn the_level_of_a_pin_is_found_by_its_number_and_not_made_up() {
+        let digital = |pin, state| ur_msgs::Digital { pin, state };
+        let states = [digital(16, true), digital(3, false)];
+        assert_eq!(pin_level(&states, 16), Some(true));
+        assert_eq!(pin_level(&states, 3), Some(false));
+        assert_eq!(pin_level(&states, 0), None);
+    }
 
     fn trajectory() -> JointTrajectory {
         let point = |millis: u32, value: f64| TrajectoryPoint {

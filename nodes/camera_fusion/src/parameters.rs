@@ -126,7 +126,7 @@ impl Parameters for CameraFusionParameters {
     const DOCUMENTATION: &'static str = include_str!("../../../config/camera_fusion.yaml");
     const RANGES: &'static [(&'static str, Range)] = &[
         ("tolerance_s", Range::NOT_NEGATIVE),
-        ("camera_timeout_s", Range::Float(0.001, 3600.0)),
+        ("camera_timeout_s", Range::DURATION_S),
         ("frames", Range::Integer(1, 31)),
         ("percentile", Range::SHARE),
         ("edge_step_m", Range::POSITIVE),
@@ -156,9 +156,7 @@ impl Parameters for CameraFusionParameters {
                 ));
             }
         }
-        if self.world_frame.is_empty() {
-            return Err(InvalidParameter::new("world_frame", "must not be empty"));
-        }
+        InvalidParameter::unless_given("world_frame", &self.world_frame)?;
         let WorkspaceParameters {
             rows,
             cols,

@@ -3,7 +3,7 @@
 use std::path::{Path, PathBuf};
 
 use gctn::Device;
-use node_kit::{ChangeParameters, InvalidParameter, Parameters, Range};
+use node_kit::{ChangeParameters, InvalidParameter, Parameters, Range, Ranges};
 use serde::{Deserialize, Serialize};
 
 /// Explained in config/gctn_policy.yaml.
@@ -50,12 +50,11 @@ impl GctnPolicyParameters {
 
 impl Parameters for GctnPolicyParameters {
     const DOCUMENTATION: &'static str = include_str!("../../../config/gctn_policy.yaml");
-    const RANGES: &'static [(&'static str, Range)] = &[
+    const RANGES: Ranges = &[
         ("threads", Range::Integer(1, 256)),
         ("exclusion_radius_m", Range::POSITIVE),
-        ChangeParameters::RANGES[0],
-        ChangeParameters::RANGES[1],
     ];
+    const GROUPS: &'static [(&'static str, Ranges)] = &[("", ChangeParameters::RANGES)];
     const CHANGEABLE: &'static [&'static str] = &ChangeParameters::NAMES;
 }
 

@@ -66,9 +66,7 @@ impl Parameters for GoalOracleParameters {
     const DOCUMENTATION: &'static str = include_str!("../../../config/goal_oracle.yaml");
 
     fn validate(&self) -> Result<(), InvalidParameter> {
-        if self.world_frame.is_empty() {
-            return Err(InvalidParameter::new("world_frame", "must not be empty"));
-        }
+        InvalidParameter::unless_given("world_frame", &self.world_frame)?;
         if self.goal_module == GoalModule::Embedding && self.embedding == Path::new("") {
             return Err(InvalidParameter::new(
                 "embedding",

@@ -10,9 +10,10 @@ use msgs::control_msgs::FollowJointTrajectory;
 use msgs::std_msgs::Bool;
 use msgs::ur_msgs::FollowJointTrajectoryUntil;
 use node_kit::{
-    ActionClient, Active, CallOptions, Level, Node, Parameters, Qos, Range, Subscription,
+    ActionClient, Active, CallOptions, Level, Node, Parameters, Qos, Range, Subscription, when,
 };
 use serde::{Deserialize, Serialize};
+use tokio::time::sleep_until;
 use tracing::{error, warn};
 
 use crate::watch::Watch;
@@ -86,7 +87,7 @@ impl Active for WatchdogNode {
             tokio::select! {
                 biased;
                 message = heartbeats.recv() => watch.on_heartbeat(message.data, Instant::now()),
-                () = sleep_until(deadline) => {}
+                () = when(deadline.map(|deadline| sleep_until(deadline.into()))) => {}
                 () = node.deactivated() => return Ok(()),
             }
             if watch.has_died(Instant::now()) {
@@ -133,13 +134,6 @@ fn insist_on_cancel<A: Action + 'static>(
             tokio::time::sleep(CANCEL_PERIOD).await;
         }
     });
-}
-
-async fn sleep_until(deadline: Option<Instant>) {
-    match deadline {
-        Some(deadline) => tokio::time::sleep_until(deadline.into()).await,
-        None => std::future::pending().await,
-    }
 }
 
 #[cfg(test)]

@@ -5,7 +5,6 @@ use msgs::convert::{self, ConvertError};
 use msgs::diagnostic_msgs::DiagnosticStatus;
 use msgs::sctn_msgs::PlannedMotion;
 use msgs::sensor_msgs::Image;
-use msgs::ur_msgs::Digital;
 use step_protocol::ProposalId;
 
 /// A message that makes no sense: which field, and what was expected.
@@ -77,14 +76,6 @@ pub fn report_from_msg(status: DiagnosticStatus) -> Option<NodeReport> {
     let values = status.values.into_iter();
     let values = values.map(|value| (value.key, value.value));
     NodeReport::of_status(&status.name, status.level, status.message, values)
-}
-
-/// Level of a digital pin, where it is told.
-pub fn level(states: &[Digital], pin: u8) -> Option<bool> {
-    let mut states = states.iter();
-    states
-        .find(|state| state.pin == pin)
-        .map(|state| state.state)
 }
 
 #[cfg(test)]

@@ -6,7 +6,6 @@ mod commands;
 mod convert;
 mod parameters;
 
-use std::future::Future;
 use std::sync::Arc;
 use std::time::Duration;
 
@@ -14,7 +13,7 @@ use anyhow::Context as _;
 use console::{Console, Joints, Page, Server, Watch};
 use msgs::convert::{
     confirmation_from_msg, confirmation_refused_from_msg, goal_from_msg, observation_from_msg,
-    proposal_from_msg, result_from_msg, reward_from_msg,
+    pin_level, proposal_from_msg, result_from_msg, reward_from_msg,
 };
 use msgs::diagnostic_msgs::DiagnosticArray;
 use msgs::sctn_msgs::{
@@ -32,7 +31,7 @@ use tokio_util::sync::CancellationToken;
 use tracing::{info, warn};
 
 use crate::commands::Commands;
-use crate::convert::{level, motion_from_msg, report_from_msg, scores_from_msg};
+use crate::convert::{motion_from_msg, report_from_msg, scores_from_msg};
 
 pub use parameters::OperatorConsoleParameters;
 
@@ -82,7 +81,7 @@ impl Active for ConsoleNode {
         let read = node.spawn_blocking(move || page.begin(&demonstration));
         read.await.context("reading the library panicked")?;
         self.serve(node, &end).await?;
-        self.follow_cameras(node, &end);
+        self.follow_cameras(node);
         let io_and_status = |name| format!("{}/{name}", self.parameters.io_and_status);
         let mut heightmaps = node.subscription::<Heightmap>("heightmap", Qos::Latched)?;
         let mut goals = node.subscription::<Goal>("goal", Qos::Latched)?;
@@ -172,8 +171,8 @@ impl Active for ConsoleNode {
                 },
                 message = heartbeats.recv() => console.change_quietly(|state, now| state.run.on_motion(message.data, now)),
                 message = pins.recv() => {
-                    let suction = level(&message.digital_out_states, self.parameters.suction_pin);
-                    let vacuum = level(&message.digital_in_states, self.parameters.vacuum_pin);
+                    let suction = pin_level(&message.digital_out_states, self.parameters.suction_pin);
+                    let vacuum = pin_level(&message.digital_in_states, self.parameters.vacuum_pin);
                     console.hear(|state, _| state.run.on_pins(suction, vacuum));
                 }
                 message = robot_modes.recv() => console.change(|state, _| state.run.on_robot_mode(message.mode)),
@@ -213,35 +212,28 @@ impl ConsoleNode {
         Ok(())
     }
 
-    /// Keeps images and transforms until `end`.
-    fn follow_cameras(&self, node: &Node, end: &CancellationToken) {
+    /// Keeps images and transforms while the node is active.
+    fn follow_cameras(&self, node: &Node) {
         let cameras = || Arc::clone(&self.page.cameras);
         let transforms = cameras::follow_transforms(node.clone(), cameras());
-        spawn_until(
-            node,
-            end,
-            "a proposal on the cameras' images".to_owned(),
-            transforms,
-        );
+        show(node, "a proposal on the cameras' images".into(), transforms);
         let names = self.parameters.page.cameras.iter();
         for name in names.filter(|name| !name.is_empty()) {
             let topics = self.parameters.camera_preset.topics(name);
             let images = cameras::follow(node.clone(), cameras(), name.clone(), topics);
-            spawn_until(node, end, format!("camera {name}"), images);
+            show(node, format!("camera {name}"), images);
         }
     }
 }
 
-/// Does `work` until `end`, on a task of its own.
-fn spawn_until(
+/// Does `work`, on a task of its own; `what` is not shown without it.
+fn show(
     node: &Node,
-    end: &CancellationToken,
     what: String,
     work: impl Future<Output = anyhow::Result<()>> + Send + 'static,
 ) {
-    let work = end.clone().run_until_cancelled_owned(work);
     node.spawn(async move {
-        if let Some(Err(error)) = work.await {
+        if let Err(error) = work.await {
             warn!("{what} is not shown: {error:#}");
         }
     });

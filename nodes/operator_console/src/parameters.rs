@@ -4,7 +4,7 @@ use std::path::PathBuf;
 
 use console::{PageSettings, ServerSettings};
 use msgs::CameraPreset;
-use node_kit::{ChangeParameters, InvalidParameter, Parameters, Range};
+use node_kit::{ChangeParameters, InvalidParameter, Parameters, Range, Ranges};
 use serde::{Deserialize, Serialize};
 
 /// Explained in config/operator_console.yaml.
@@ -60,16 +60,15 @@ impl Default for OperatorConsoleParameters {
 
 impl Parameters for OperatorConsoleParameters {
     const DOCUMENTATION: &'static str = include_str!("../../../config/operator_console.yaml");
-    const RANGES: &'static [(&'static str, Range)] = &[
+    const RANGES: Ranges = &[
         ("port", Range::Integer(0, 65535)),
         ("max_viewers", Range::Integer(1, 256)),
         ("stale_after_s", Range::POSITIVE),
-        ChangeParameters::RANGES[0],
-        ChangeParameters::RANGES[1],
         ("session_timeout_s", Range::POSITIVE),
-        ("suction_pin", Range::Integer(0, 17)),
-        ("vacuum_pin", Range::Integer(0, 17)),
+        ("suction_pin", Range::PIN),
+        ("vacuum_pin", Range::PIN),
     ];
+    const GROUPS: &'static [(&'static str, Ranges)] = &[("", ChangeParameters::RANGES)];
 
     fn validate(&self) -> Result<(), InvalidParameter> {
         let refused = self.server.check();
@@ -81,9 +80,7 @@ impl Parameters for OperatorConsoleParameters {
             ("io_and_status", &self.io_and_status),
             ("speed_scaling", &self.speed_scaling),
         ] {
-            if value.is_empty() {
-                return Err(InvalidParameter::new(name, "must not be empty"));
-            }
+            InvalidParameter::unless_given(name, value)?;
         }
         Ok(())
     }

@@ -3,7 +3,7 @@
 use std::path::PathBuf;
 
 use cell_emulation::EmulatorSettings;
-use node_kit::{Parameters, Range};
+use node_kit::{Parameters, Range, Ranges};
 use serde::{Deserialize, Serialize};
 
 /// Parameters of the node.
@@ -35,39 +35,10 @@ impl Default for SimWorkcellParameters {
     }
 }
 
-/// Times of the wall clock, in s.
-const PERIOD: Range = Range::Float(0.001, 3600.0);
-/// Times that hardware takes, in s.
-const DELAY: Range = Range::Float(0.0, 60.0);
-/// Pins of the control box and the tool.
-const PIN: Range = Range::Integer(0, 17);
-
 impl Parameters for SimWorkcellParameters {
     const DOCUMENTATION: &'static str = include_str!("../../../config/sim_workcell.yaml");
-    const RANGES: &'static [(&'static str, Range)] = &[
-        ("seed", Range::Integer(0, i64::MAX)),
-        ("suction_pin", PIN),
-        ("vacuum_pin", PIN),
-        ("real_time_factor", Range::NOT_NEGATIVE),
-        // At most the rate of the physics.
-        ("joint_states_rate_hz", Range::Float(1.0, 480.0)),
-        ("status_period_s", PERIOD),
-        ("frames_period_s", PERIOD),
-        ("hardware.until_answer_min_s", DELAY),
-        ("hardware.until_answer_max_s", DELAY),
-        ("hardware.servo_delay_s", Range::Float(0.0, 1.0)),
-        ("hardware.path_tolerance_rad", Range::POSITIVE),
-        ("hardware.encoder_noise_rad", Range::Float(0.0, 0.1)),
-        ("hardware.speed_scaling", Range::Float(0.01, 1.0)),
-        ("hardware.braking_time_s", Range::Float(0.0, 1.0)),
-        ("hardware.software_major", Range::Integer(3, 10)),
-        ("hardware.tool_voltage", Range::Integer(0, 24)),
-        ("hardware.vacuum_build_s", DELAY),
-        ("hardware.vacuum_release_s", DELAY),
-        ("hardware.vacuum_leak_s", Range::NOT_NEGATIVE),
-        ("hardware.blow_off_pin", Range::Integer(-1, 17)),
-        ("hardware.enable_pin", Range::Integer(-1, 17)),
-    ];
+    const RANGES: Ranges = &[("suction_pin", Range::PIN), ("vacuum_pin", Range::PIN)];
+    const GROUPS: &'static [(&'static str, Ranges)] = &[("", EmulatorSettings::RANGES)];
     const CHANGEABLE: &'static [&'static str] = &[
         "real_time_factor",
         "status_period_s",

@@ -10,8 +10,7 @@ use crate::parameters::SuctionExecutorParameters;
 /// # Errors
 /// Names the parameter, and the file where it is one.
 pub(crate) fn load(parameters: &SuctionExecutorParameters) -> anyhow::Result<WorkCell> {
-    let cell = WorkCell::load_or_builtin(&parameters.urdf).context("parameter urdf")?;
-    let mut cell = cell
+    let mut cell = node_kit::load_work_cell(&parameters.urdf)?
         .with_calibration_file(&parameters.arm_calibration)
         .context("parameter arm_calibration")?;
     let joints = &parameters.joints;

@@ -12,7 +12,8 @@ use anyhow::Context as _;
 use collision::{CollisionChecker, Margins};
 use msgs::sctn_msgs;
 use node_kit::{
-    ActionServer, Active, Node, Publisher, Qos, RequestId, RunningGoal, ServiceServer, Subscription,
+    ActionServer, Active, Node, Publisher, Qos, RequestId, RunningGoal, ServiceServer,
+    Subscription, when,
 };
 use rehearsal::{RehearsalRules, Rehearsals, Rehearsed};
 use step_protocol::{Executor, Recovery, StopCause};
@@ -39,9 +40,6 @@ pub async fn configure(
 ) -> anyhow::Result<ExecutorNode> {
     ur_driver::planted::check()?;
     let work_cell = cell::load(&parameters)?;
-    if let Some(warning) = work_cell.warning() {
-        warn!("parameter urdf: {warning}");
-    }
     let margins = Margins {
         obstacle_m: parameters.collision_margin_m,
         ..Margins::default()
@@ -208,13 +206,5 @@ impl ActiveNode<'_> {
             warn!("the driver has not answered a goal");
         }
         Ok(())
-    }
-}
-
-/// Waits for something that may not be there: then for ever.
-async fn when<T>(something: Option<impl Future<Output = T>>) -> T {
-    match something {
-        Some(something) => something.await,
-        None => std::future::pending().await,
     }
 }

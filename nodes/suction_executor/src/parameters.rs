@@ -5,8 +5,7 @@ use std::sync::Arc;
 use std::time::Duration;
 
 use collision::CollisionChecker;
-use heightmap::ChangeRules;
-use node_kit::{Parameters, Range};
+use node_kit::{ChangeParameters, Parameters, Range, Ranges};
 use pick_place::{ContactSettings, PrimitiveSettings};
 use rehearsal::RehearsalRules;
 use serde::{Deserialize, Serialize};
@@ -40,10 +39,9 @@ pub struct SuctionExecutorParameters {
     pub limits: Limits,
     /// What the joints may do in planned motions.
     pub joints: JointLimits,
-    /// A cell of the heightmap has changed when its height differs by more.
-    pub observation_tolerance_m: f64,
-    /// The observation has changed where so many mm^2 of connected cells have.
-    pub observation_changed_area_mm2: f64,
+    /// When the observation has changed.
+    #[serde(flatten)]
+    pub changes: ChangeParameters,
     /// Seconds of ROS time; an approval needs a heightmap that is not older.
     pub observation_max_age_s: f64,
     /// Whether heightmaps count only where the arm was at home and at rest when they were taken.
@@ -110,8 +108,7 @@ impl Default for SuctionExecutorParameters {
             arm_calibration: PathBuf::new(),
             limits: Limits::default(),
             joints: JointLimits::default(),
-            observation_tolerance_m: 0.005,
-            observation_changed_area_mm2: 75.0,
+            changes: ChangeParameters::default(),
             observation_max_age_s: 5.0,
             observation_needs_home: false,
             collision_margin_m: 0.01,
@@ -158,18 +155,13 @@ impl Limits {
     }
 }
 
-/// Times of the wall clock, in s.
-const TIME: Range = Range::Float(0.001, 3600.0);
-/// Pins of the control box and the tool.
-const PIN: Range = Range::Integer(0, 17);
-
 impl SuctionExecutorParameters {
     /// What the gate goes by.
     pub(crate) fn gate_rules(&self) -> GateRules {
         GateRules {
             frame: self.world_frame.clone(),
             limits: self.limits.settings(),
-            changes: self.changes(),
+            changes: self.changes.rules(),
             confirmation_grace: Duration::from_secs_f64(self.confirmation_grace_s),
             require_approval: self.require_approval(),
             operators: self.operators.clone(),
@@ -185,15 +177,8 @@ impl SuctionExecutorParameters {
             observation_max_age: Duration::from_secs_f64(self.observation_max_age_s),
             contact: self.contact,
             sign: self.driver.contact,
-            changes: self.changes(),
+            changes: self.changes.rules(),
         }
-    }
-
-    fn changes(&self) -> ChangeRules {
-        ChangeRules::new(
-            self.observation_tolerance_m,
-            1e-6 * self.observation_changed_area_mm2,
-        )
     }
 
     fn require_approval(&self) -> RequireApproval {
@@ -209,7 +194,7 @@ impl SuctionExecutorParameters {
 
 impl Parameters for SuctionExecutorParameters {
     const DOCUMENTATION: &'static str = include_str!("../../../config/suction_executor.yaml");
-    const RANGES: &'static [(&'static str, Range)] = &[
+    const RANGES: Ranges = &[
         ("limits.clearance_m", Range::POSITIVE),
         ("limits.lift_m", Range::POSITIVE),
         ("limits.travel_m_s", Range::POSITIVE),
@@ -219,35 +204,19 @@ impl Parameters for SuctionExecutorParameters {
         ("joints.acceleration_rad_s2", Range::POSITIVE),
         ("joints.jerk_rad_s3", Range::POSITIVE),
         ("joints.hose_turn_rad", Range::NOT_NEGATIVE),
-        ("observation_tolerance_m", Range::POSITIVE),
-        ("observation_changed_area_mm2", Range::POSITIVE),
         ("collision_margin_m", Range::Float(0.0, 0.2)),
         ("sure_probability", Range::SHARE),
         ("presence_timeout_s", Range::POSITIVE),
-        ("observation_max_age_s", TIME),
-        ("confirmation_grace_s", TIME),
+        ("observation_max_age_s", Range::DURATION_S),
+        ("confirmation_grace_s", Range::DURATION_S),
         ("contact.slow_from_m", Range::Float(0.0, 0.2)),
         ("contact.slow_m_s", Range::Float(0.005, 0.5)),
         ("contact.window_m", Range::Float(0.001, 0.1)),
         ("contact.press_m", Range::Float(0.0, 0.01)),
-        ("driver.suction_pin", PIN),
-        ("driver.vacuum_pin", PIN),
-        ("driver.enable_pin", Range::Integer(-1, 17)),
-        ("driver.status_max_age_s", TIME),
-        ("driver.reading_timeout_s", TIME),
-        ("driver.rest_speed_rad_s", Range::POSITIVE),
-        ("driver.rest_time_s", TIME),
-        ("driver.path_tolerance_rad", Range::POSITIVE),
-        ("driver.goal_tolerance_rad", Range::POSITIVE),
-        ("driver.motion_time_factor", Range::POSITIVE),
-        ("driver.motion_time_margin_s", TIME),
-        ("driver.grasp_wait_s", Range::Float(0.0, 60.0)),
-        ("driver.release_wait_s", Range::Float(0.0, 60.0)),
-        ("driver.blow_off_pin", Range::Integer(-1, 17)),
-        ("driver.answer_timeout_s", TIME),
-        ("driver.stop_timeout_s", TIME),
-        ("driver.call_timeout_s", TIME),
-        ("driver.call_attempts", Range::Integer(1, 100)),
+    ];
+    const GROUPS: &'static [(&'static str, Ranges)] = &[
+        ("", ChangeParameters::RANGES),
+        ("driver.", DriverParameters::RANGES),
     ];
     // What may move, on which view and on whose word, how fast, and what stops it: not for the network to change, whether or not the node is
     // configured. The test below says of each other parameter why it may be set.
@@ -269,8 +238,8 @@ impl Parameters for SuctionExecutorParameters {
         "joints.acceleration_rad_s2",
         "joints.jerk_rad_s3",
         "joints.hose_turn_rad",
-        "observation_tolerance_m",
-        "observation_changed_area_mm2",
+        ChangeParameters::NAMES[0],
+        ChangeParameters::NAMES[1],
         "observation_max_age_s",
         "observation_needs_home",
         "collision_margin_m",

@@ -7,14 +7,14 @@ use msgs::rosbag2_interfaces as services;
 use msgs::rosgraph_msgs::Clock;
 use msgs::tf2_msgs::TFMessage;
 use msgs::{Interface, to_cdr};
-use node_kit::{Node, RawPublisher, RawQos, stamp_from_ns};
+use node_kit::{Node, RawPublisher, RawQos, stamp_from_ns, when};
 use regex::RegexSet;
 use std::collections::{BTreeMap, BTreeSet};
 use std::path::Path;
 use std::sync::{Arc, Mutex, PoisonError};
 use std::time::Duration;
 use tokio::sync::mpsc;
-use tokio::time::Instant;
+use tokio::time::{Instant, sleep_until};
 
 /// Messages that are read ahead of their time.
 const READ_AHEAD: usize = 32;
@@ -348,7 +348,7 @@ impl Player {
                             publish_clock(clock, self.pace.bag_time(Instant::now()));
                         }
                     }
-                    () = until(due) => break,
+                    () = when(due.map(sleep_until)) => break,
                 }
             }
             self.publishers.publish(message);
@@ -432,13 +432,6 @@ fn obey(order: Order, pace: &mut Pace, wall: Instant) {
         "{}, rate {rate:.2}",
         if paused { "paused" } else { "playing" }
     );
-}
-
-async fn until(due: Option<Instant>) {
-    match due {
-        Some(due) => tokio::time::sleep_until(due).await,
-        None => std::future::pending().await,
-    }
 }
 
 fn publish_clock(clock: &RawPublisher, now: Duration) {

@@ -13,7 +13,7 @@ use msgs::ur_msgs::{
     FollowJointTrajectoryUntil, GetRobotSoftwareVersion, GetRobotSoftwareVersionResponse, SetIO,
     SetIORequest, SetIOResponse,
 };
-use node_kit::{ActionServer, NewGoal, Node, NodeError, ServiceServer};
+use node_kit::{ActionServer, NewGoal, Node, NodeError, ServiceServer, when};
 use tokio::sync::{oneshot, watch};
 use tracing::error;
 
@@ -180,7 +180,7 @@ impl DriverServer {
         loop {
             tokio::select! {
                 goal = self.follow.recv() => pass_on(Request::Follow(Box::new(goal))),
-                goal = next_goal(&mut self.until) => pass_on(Request::Until(Box::new(goal))),
+                goal = when(self.until.as_mut().map(ActionServer::recv)) => pass_on(Request::Until(Box::new(goal))),
                 () = repeated(&mut self.repeats) => {
                     error!("a goal id has come twice: the trajectory controller's process is gone");
                     pass_on(Request::Die);
@@ -217,16 +217,6 @@ impl DriverServer {
                 },
             }
         }
-    }
-}
-
-/// Waits for a goal; for ever where the action is not served.
-async fn next_goal(
-    until: &mut Option<ActionServer<FollowJointTrajectoryUntil>>,
-) -> NewGoal<FollowJointTrajectoryUntil> {
-    match until {
-        Some(until) => until.recv().await,
-        None => std::future::pending().await,
     }
 }
 

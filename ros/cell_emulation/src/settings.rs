@@ -3,6 +3,7 @@
 use std::path::PathBuf;
 
 use driver_model::HardwareSettings;
+use node_kit::{Range, Ranges};
 use serde::{Deserialize, Serialize};
 
 use crate::server::ActionNames;
@@ -57,7 +58,34 @@ impl Default for EmulatorSettings {
     }
 }
 
+/// Times that hardware takes (s).
+const DELAY: Range = Range::Float(0.0, 60.0);
+
 impl EmulatorSettings {
+    /// Bounds, by dotted name.
+    pub const RANGES: Ranges = &[
+        ("seed", Range::Integer(0, i64::MAX)),
+        ("real_time_factor", Range::NOT_NEGATIVE),
+        // At most the rate of the physics.
+        ("joint_states_rate_hz", Range::Float(1.0, 480.0)),
+        ("status_period_s", Range::DURATION_S),
+        ("frames_period_s", Range::DURATION_S),
+        ("hardware.until_answer_min_s", DELAY),
+        ("hardware.until_answer_max_s", DELAY),
+        ("hardware.servo_delay_s", Range::Float(0.0, 1.0)),
+        ("hardware.path_tolerance_rad", Range::POSITIVE),
+        ("hardware.encoder_noise_rad", Range::Float(0.0, 0.1)),
+        ("hardware.speed_scaling", Range::Float(0.01, 1.0)),
+        ("hardware.braking_time_s", Range::Float(0.0, 1.0)),
+        ("hardware.software_major", Range::Integer(3, 10)),
+        ("hardware.tool_voltage", Range::Integer(0, 24)),
+        ("hardware.vacuum_build_s", DELAY),
+        ("hardware.vacuum_release_s", DELAY),
+        ("hardware.vacuum_leak_s", Range::NOT_NEGATIVE),
+        ("hardware.blow_off_pin", Range::PIN_OR_NONE),
+        ("hardware.enable_pin", Range::PIN_OR_NONE),
+    ];
+
     /// Names of the motion actions.
     pub fn actions(&self) -> ActionNames {
         ActionNames {

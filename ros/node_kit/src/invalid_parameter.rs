@@ -18,4 +18,33 @@ impl InvalidParameter {
             reason: reason.into(),
         }
     }
+
+    /// For a text that a node cannot do without: `Ok` unless it is empty.
+    ///
+    /// # Errors
+    /// Says that it must not be empty.
+    pub fn unless_given(name: &str, text: &str) -> Result<(), Self> {
+        match text.is_empty() {
+            true => Err(Self::new(name, "must not be empty")),
+            false => Ok(()),
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn an_empty_text_is_refused_by_the_parameters_name() {
+        assert_eq!(
+            InvalidParameter::unless_given("world_frame", "world"),
+            Ok(())
+        );
+        let error = InvalidParameter::unless_given("world_frame", "").unwrap_err();
+        assert_eq!(
+            error.to_string(),
+            "parameter world_frame: must not be empty"
+        );
+    }
 }

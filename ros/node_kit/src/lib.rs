@@ -31,6 +31,7 @@ mod shared_parameters;
 mod statistics;
 mod task_group;
 mod topic;
+mod when;
 
 pub use action::{ActionClient, ActionServer, GoalId, GoalStatus, NewGoal, RunningGoal, SentGoal};
 pub use arguments::{ArgumentError, ParameterSource, Remap, RosArguments};
@@ -44,8 +45,8 @@ pub use invalid_parameter::InvalidParameter;
 pub use lifecycle::{Active, LifecycleClient, LifecycleError, State, Transition};
 pub use node::{Node, NodeError};
 pub use parameters::{
-    Loaded, NoParameters, ParameterError, Parameters, Range, load as load_parameters, load_text,
-    mistakes_in_documentation,
+    Loaded, NoParameters, ParameterError, Parameters, Range, Ranges, load as load_parameters,
+    load_text, mistakes_in_documentation,
 };
 pub use plain::plain_node;
 pub use qos::Qos;
@@ -60,3 +61,4 @@ pub use shared_parameters::{ChangeParameters, load_work_cell};
 pub use statistics::{Snapshot, Statistics};
 pub use task_group::TaskGroup;
 pub use topic::{Publisher, Subscription};
+pub use when::when;

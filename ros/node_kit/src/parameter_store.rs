@@ -18,7 +18,9 @@ use tokio::sync::watch;
 
 use crate::{
     invalid_parameter::InvalidParameter,
-    parameters::{Loaded, OF_EVERY_NODE, Parameters, Range, descriptions, from_values, shown},
+    parameters::{
+        Loaded, OF_EVERY_NODE, Parameters, Range, descriptions, from_values, range, shown,
+    },
 };
 
 /// Dotted names and values.
@@ -80,7 +82,6 @@ impl ParameterStore {
             declarations.insert(name.to_owned(), declaration);
         }
         for (name, default) in shown(&P::default())? {
-            let range = P::RANGES.iter().find(|(ranged, _)| *ranged == name);
             let access = if P::FIXED.contains(&name.as_str()) {
                 Access::Never
             } else if P::CHANGEABLE.contains(&name.as_str()) {
@@ -90,7 +91,7 @@ impl ParameterStore {
             };
             let declaration = Declaration {
                 description: description(&name, ""),
-                range: range.map(|(_, range)| *range),
+                range: range::<P>(&name),
                 kind: kind(&default),
                 access,
             };

@@ -20,7 +20,9 @@ pub trait Parameters:
     /// `describe_parameters`. A parameter without a comment of its own shares that of the line above.
     const DOCUMENTATION: &'static str = "";
     /// Dotted names and bounds of numbers.
-    const RANGES: &'static [(&'static str, Range)] = &[];
+    const RANGES: Ranges = &[];
+    /// Bounds that stand beside the parameters of a library: what the names below begin with in this node, as `driver.`, and the bounds.
+    const GROUPS: &'static [(&'static str, Ranges)] = &[];
     /// Dotted names of those that may be set while the node is configured; the others are read when it is
     /// configured. The node learns of a change by [`Node::parameters`](crate::Node::parameters).
     const CHANGEABLE: &'static [&'static str] = &[];
@@ -36,12 +38,27 @@ pub trait Parameters:
     /// Checks everything: ranges, then [`validate`](Self::validate).
     fn check(&self) -> Result<(), InvalidParameter> {
         for (name, value) in shown(self)? {
-            if let Some((_, range)) = Self::RANGES.iter().find(|(ranged, _)| *ranged == name) {
+            if let Some(range) = range::<Self>(&name) {
                 range.check(&name, &value)?;
             }
         }
         self.validate()
     }
+}
+
+/// All dotted names with bounds.
+fn ranges<P: Parameters>() -> impl Iterator<Item = (String, Range)> {
+    let groups = std::iter::once(&("", P::RANGES)).chain(P::GROUPS);
+    groups.flat_map(|(prefix, ranges)| {
+        let named = move |(name, range): &(&str, Range)| (format!("{prefix}{name}"), *range);
+        ranges.iter().map(named)
+    })
+}
+
+/// The bounds of a parameter.
+pub(crate) fn range<P: Parameters>(name: &str) -> Option<Range> {
+    let found = ranges::<P>().find(|(ranged, _)| ranged == name);
+    found.map(|(_, range)| range)
 }
 
 /// No parameters but those that every node has.
@@ -59,6 +76,9 @@ pub(crate) const OF_EVERY_NODE: [(&str, &str); 2] = [
         "Whether the node configures and activates itself. False: it waits for a lifecycle manager.",
     ),
 ];
+
+/// Names and bounds of numbers.
+pub type Ranges = &'static [(&'static str, Range)];
 
 /// Bounds of a number, both included.
 #[derive(Clone, Copy, Debug, PartialEq)]
@@ -78,6 +98,12 @@ impl Range {
     pub const FINITE: Self = Self::Float(f64::MIN, f64::MAX);
     /// 0 to 1.
     pub const SHARE: Self = Self::Float(0.0, 1.0);
+    /// How long something may take (s): at most an hour.
+    pub const DURATION_S: Self = Self::Float(0.001, 3600.0);
+    /// A pin of a UR's control box or tool.
+    pub const PIN: Self = Self::Integer(0, 17);
+    /// The same, or -1 for none.
+    pub const PIN_OR_NONE: Self = Self::Integer(-1, 17);
 
     fn check(&self, name: &str, value: &Value) -> Result<(), InvalidParameter> {
         let (inside, found) = match (self, value) {
@@ -529,10 +555,10 @@ pub fn mistakes_in_documentation<P: Parameters>(node: &str) -> Vec<String> {
             mistakes.push(format!("{file} does not explain {name}"));
         }
     }
-    let ranged = P::RANGES.iter().map(|(name, _)| *name);
-    let accessed = P::CHANGEABLE.iter().chain(P::FIXED).copied();
-    for name in ranged.chain(accessed) {
-        if !names.iter().any(|known| known == name) {
+    let ranged = ranges::<P>().map(|(name, _)| name);
+    let accessed = P::CHANGEABLE.iter().chain(P::FIXED);
+    for name in ranged.chain(accessed.map(|name| (*name).to_owned())) {
+        if !names.contains(&name) {
             mistakes.push(format!("{name} is no parameter of {node}"));
         }
     }
@@ -555,6 +581,10 @@ mod tests {
     #[serde(default, deny_unknown_fields)]
     struct Grid {
         rows: usize,
+    }
+
+    impl Grid {
+        const RANGES: Ranges = &[("rows", Range::Integer(1, 1000))];
     }
 
     impl Default for Grid {
@@ -591,6 +621,7 @@ fusion:
       rows: 320
 ";
         const RANGES: &'static [(&'static str, Range)] = &[("tolerance_s", Range::POSITIVE)];
+        const GROUPS: &'static [(&'static str, Ranges)] = &[("grid.", Grid::RANGES)];
         const CHANGEABLE: &'static [&'static str] = &["tolerance_s"];
     }
 
@@ -673,6 +704,19 @@ fusion:
         assert_eq!(
             text,
             "parameter tolerance_s (from node.yaml): must be above 0, is -1"
+        );
+    }
+
+    #[test]
+    fn the_bounds_of_a_group_are_those_of_its_names_in_the_node() {
+        assert_eq!(range::<Example>("grid.rows"), Some(Range::Integer(1, 1000)));
+        assert_eq!(range::<Example>("rows"), None);
+        let text = from_text("/**:\n  ros__parameters:\n    grid: {rows: 0}\n")
+            .unwrap_err()
+            .to_string();
+        assert_eq!(
+            text,
+            "parameter grid.rows (from node.yaml): must be 1 to 1000, is 0"
         );
     }
 

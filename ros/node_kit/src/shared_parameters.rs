@@ -7,7 +7,10 @@ use serde::{Deserialize, Serialize};
 use tracing::warn;
 use ur5::WorkCell;
 
-use crate::{invalid_parameter::InvalidParameter, parameters::Range};
+use crate::{
+    invalid_parameter::InvalidParameter,
+    parameters::{Range, Ranges},
+};
 
 /// When the table counts as changed. A node takes them among its own parameters with `#[serde(flatten)]`.
 #[derive(Clone, Copy, Debug, PartialEq, Serialize, Deserialize)]
@@ -34,7 +37,7 @@ impl ChangeParameters {
     pub const NAMES: [&'static str; 2] =
         ["observation_tolerance_m", "observation_changed_area_mm2"];
     /// Their bounds.
-    pub const RANGES: [(&'static str, Range); 2] = [
+    pub const RANGES: Ranges = &[
         (Self::NAMES[0], Range::POSITIVE),
         (Self::NAMES[1], Range::POSITIVE),
     ];
@@ -75,7 +78,7 @@ mod tests {
     }
 
     impl Parameters for Example {
-        const RANGES: &'static [(&'static str, Range)] = &ChangeParameters::RANGES;
+        const GROUPS: &'static [(&'static str, Ranges)] = &[("", ChangeParameters::RANGES)];
     }
 
     fn read(line: &str) -> Result<Example, String> {

@@ -46,6 +46,12 @@ impl Heartbeat {
         Moving(self.moving.clone())
     }
 
+    /// How many motions are under way and goals unanswered.
+    #[cfg(test)]
+    pub(crate) fn under_way(&self) -> usize {
+        *self.moving.borrow()
+    }
+
     /// Waits until no motion is under way and no goal is unanswered.
     pub(crate) async fn idle(&self) {
         let mut moving = self.moving.subscribe();

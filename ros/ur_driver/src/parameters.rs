@@ -1,5 +1,6 @@
 //! Parameters of the driver's edge; the node that uses it documents each in its configuration file.
 
+use node_kit::{Range, Ranges};
 use pick_place::ContactSign;
 use serde::{Deserialize, Serialize};
 
@@ -91,4 +92,28 @@ impl Default for DriverParameters {
             call_attempts: 5,
         }
     }
+}
+
+impl DriverParameters {
+    /// Bounds, by name.
+    pub const RANGES: Ranges = &[
+        ("suction_pin", Range::PIN),
+        ("vacuum_pin", Range::PIN),
+        ("enable_pin", Range::PIN_OR_NONE),
+        ("status_max_age_s", Range::DURATION_S),
+        ("reading_timeout_s", Range::DURATION_S),
+        ("rest_speed_rad_s", Range::POSITIVE),
+        ("rest_time_s", Range::DURATION_S),
+        ("path_tolerance_rad", Range::POSITIVE),
+        ("goal_tolerance_rad", Range::POSITIVE),
+        ("motion_time_factor", Range::POSITIVE),
+        ("motion_time_margin_s", Range::DURATION_S),
+        ("grasp_wait_s", Range::Float(0.0, 60.0)),
+        ("release_wait_s", Range::Float(0.0, 60.0)),
+        ("blow_off_pin", Range::PIN_OR_NONE),
+        ("answer_timeout_s", Range::DURATION_S),
+        ("stop_timeout_s", Range::DURATION_S),
+        ("call_timeout_s", Range::DURATION_S),
+        ("call_attempts", Range::Integer(1, 100)),
+    ];
 }

@@ -2,11 +2,11 @@
 
 use std::time::{Duration, Instant};
 
-use msgs::convert;
+use msgs::convert::{self, pin_level};
 use msgs::sensor_msgs::JointState;
 use msgs::std_msgs::Bool;
 use msgs::ur_dashboard_msgs::{RobotMode, SafetyMode};
-use msgs::ur_msgs::{Digital, IOStates};
+use msgs::ur_msgs::IOStates;
 use node_kit::{Node, NodeError, Qos, TaskGroup};
 use tokio::sync::watch;
 use ur5::WorkCell;
@@ -51,10 +51,10 @@ pub(crate) fn follow_status(
                     Err(error) => joint_states.reject(error),
                 },
                 message = io_states.recv() => {
-                    let suction = level(&message.digital_out_states, suction_pin);
-                    let vacuum = level(&message.digital_in_states, vacuum_pin);
+                    let suction = pin_level(&message.digital_out_states, suction_pin);
+                    let vacuum = pin_level(&message.digital_in_states, vacuum_pin);
                     let enabled = match enable_pin {
-                        Some(pin) => level(&message.digital_in_states, pin),
+                        Some(pin) => pin_level(&message.digital_in_states, pin),
                         None => Some(true),
                     };
                     match (suction, vacuum, enabled) {
@@ -81,11 +81,4 @@ pub(crate) fn follow_status(
         }
     });
     Ok(receiver)
-}
-
-fn level(states: &[Digital], pin: u8) -> Option<bool> {
-    states
-        .iter()
-        .find(|state| state.pin == pin)
-        .map(|state| state.state)
 }

@@ -3,6 +3,7 @@
 use std::path::Path;
 
 use msgs::control_msgs::FollowJointTrajectoryGoal;
+use msgs::convert::pin_level;
 use msgs::rcl_interfaces::{
     Parameter, ParameterType, ParameterValue, SetParameters, SetParametersRequest,
 };
@@ -182,7 +183,16 @@ impl Bench {
             .positions_rad
     }
 
-    /// Furthest that a joint goes from where it is in some seconds (rad).
+    /// Waits until a goal is sent, while its answer takes time.
+    async fn goal_on_its_way(&self) {
+        // The motion, and its goal without an answer.
+        self.until("goal on its way", |bench| {
+            bench.client.heartbeat.under_way() == 2
+        })
+        .await;
+    }
+
+    /// Furthest that a joint goes from where it is in some seconds (rad): what rests, rests for as long as that.
     async fn travel_rad(&self, seconds: f64) -> f64 {
         let begin = self.joints();
         let end = Instant::now() + Duration::from_secs_f64(seconds);
@@ -318,12 +328,13 @@ async fn a_stop_acts_while_a_descent_is_unanswered_and_what_is_accepted_later_do
     let descent = bench.over_the_table().await;
     let stop = CancellationToken::new();
     let descended = bench.work(&stop, move |robot| robot.follow_until_contact(&descent));
-    tokio::time::sleep(Duration::from_millis(300)).await;
+    bench.goal_on_its_way().await;
     let said = Instant::now();
     stop.cancel();
     assert_eq!(descended.await.unwrap(), Err(DriverError::Stopped));
     let took = said.elapsed();
     assert!(took < Duration::from_millis(500), "{took:?}");
+    // Twice as long as the answer takes.
     let travel_rad = bench.travel_rad(3.0).await;
     // Accepted, and cancelled at once.
     assert!(travel_rad < 2e-3, "{travel_rad}");
@@ -432,8 +443,9 @@ async fn a_motion_that_is_stopped_because_the_node_ends_is_watched_until_the_arm
         .until("motion", |bench| (bench.joints() - begin).amax() > 0.2)
         .await;
     // As on SIGTERM: the node's own tasks are dropped, then the motion is told to stop.
+    let own_task = bench.node.spawn(std::future::pending::<()>());
     bench.own.shutdown();
-    tokio::time::sleep(Duration::from_millis(50)).await;
+    assert_eq!(own_task.await.unwrap(), None);
     stop.cancel();
     assert_eq!(moved.await.unwrap(), Err(DriverError::Stopped));
     let travel_rad = bench.travel_rad(0.5).await;
@@ -447,7 +459,7 @@ async fn no_motion_begins_before_it_is_known_what_became_of_the_last_goal() {
     let descent = bench.over_the_table().await;
     let stop = CancellationToken::new();
     let descended = bench.work(&stop, move |robot| robot.follow_until_contact(&descent));
-    tokio::time::sleep(Duration::from_millis(300)).await;
+    bench.goal_on_its_way().await;
     stop.cancel();
     assert_eq!(descended.await.unwrap(), Err(DriverError::Stopped));
     let begin = Instant::now();
@@ -584,18 +596,24 @@ async fn a_driver_that_comes_back_is_not_asked_again_for_what_it_was_asked_befor
         .unwrap()
         .unwrap();
     bench.set_fault("driver_dead").await;
-    // It is dead by then, and not known to be.
-    tokio::time::sleep(Duration::from_millis(300)).await;
+    // Dead, and not known to be: it says everything several times in so long.
+    bench
+        .until("silence of the driver", |bench| {
+            let status = bench.client.status.borrow();
+            let last = status.joints.unwrap().at.max(status.pins.unwrap().at);
+            bench.client.origin.elapsed() > last + Duration::from_millis(300)
+        })
+        .await;
     let released = bench.work(&stop, |robot| robot.set_suction(false));
-    tokio::time::sleep(Duration::from_millis(2500)).await;
-    bench.set_fault("none").await;
     let reason = reason(released.await.unwrap());
     assert!(reason.contains("expected at most 1.0 s"), "{reason}");
+    bench.set_fault("none").await;
     bench
         .until("driver that is back", |bench| {
             bench.client.obstacle().is_none()
         })
         .await;
+    // A call is made again when an attempt has taken 1 s.
     tokio::time::sleep(Duration::from_millis(1500)).await;
     assert!(suction(&bench), "suction was switched off");
 }
@@ -780,11 +798,14 @@ const BLOW_OFF_PIN: u8 = 4;
 fn was_on(states: &mut Subscription<IOStates>, pin: u8) -> (bool, bool) {
     let (mut now, mut ever) = (false, false);
     while let Some(state) = states.try_recv() {
-        let mut outputs = state.digital_out_states.iter();
-        now = outputs.any(|output| output.pin == pin && output.state);
+        now = output(&state, pin);
         ever |= now;
     }
     (now, ever)
+}
+
+fn output(state: &IOStates, pin: u8) -> bool {
+    pin_level(&state.digital_out_states, pin).unwrap()
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -824,9 +845,15 @@ async fn a_part_that_sticks_is_blown_off_and_the_output_is_off_again() {
         robot.holds()
     });
     assert_eq!(released.await.unwrap(), Ok(false));
-    // One more, sent after the output was switched.
-    tokio::time::sleep(Duration::from_millis(300)).await;
-    assert_eq!(was_on(&mut states, BLOW_OFF_PIN), (false, true));
+    let (mut is_on, mut ever) = was_on(&mut states, BLOW_OFF_PIN);
+    let switched_off = tokio::time::timeout(PATIENCE, async {
+        // The state after the switch may still be on its way.
+        while is_on || !ever {
+            is_on = output(&states.recv().await, BLOW_OFF_PIN);
+            ever |= is_on;
+        }
+    });
+    assert!(switched_off.await.is_ok(), "is on: {is_on}, was: {ever}");
 }
 
 #[tokio::test(flavor = "multi_thread")]
@@ -858,8 +885,7 @@ async fn a_stop_while_a_part_is_blown_off_leaves_the_output_off() {
     );
     let _ = was_on(&mut states, BLOW_OFF_PIN);
     let next = tokio::time::timeout(PATIENCE, states.recv()).await.unwrap();
-    let mut outputs = next.digital_out_states.iter();
-    assert!(outputs.any(|output| output.pin == BLOW_OFF_PIN && !output.state));
+    assert!(!output(&next, BLOW_OFF_PIN));
 }
 
 /// An executor's edge without a driver.

@@ -257,7 +257,9 @@ impl Operator {
         let of_goal = || self.proposals.iter().rev().filter(of_goal);
         let is_at_work = |known: &&Known| match known.standing {
             Standing::Approved | Standing::Judged(_) => true,
-            Standing::Moved(_) => !known.unknown_to_tracker,
+            Standing::Moved(_) => {
+                !known.unknown_to_tracker || planted(Mutation::UnknownMotionHidesProposal)
+            }
             Standing::Open | Standing::Closed => false,
         };
         let is_unanswered = |known: &&Known| {

@@ -193,6 +193,9 @@ fn the_goals_of_an_active_state_end_with_it() {
     assert_eq!(executor.deactivate(StopCause::Deactivated), []);
     executor.activate();
     assert_eq!(executor.on_goal_cancel(), []);
+    // Its client has heard that it has ended.
+    assert_eq!(executor.status(ID), Some(ProposalStatus::Withdrawn));
+    assert!(!moves_anything(&approve(&mut executor, ID)));
     goal(&mut executor, OTHER).unwrap();
     approve(&mut executor, OTHER);
     let stopped = executor.deactivate(StopCause::Shutdown);
@@ -344,6 +347,40 @@ fn a_decision_of_somebody_who_does_not_decide_moves_nothing() {
     let decision = OperatorDecision::Approve;
     let begun = executor.on_confirmation(ID, decision, "berta", &READY, NOW);
     assert_eq!(begun, [begins(ID)]);
+}
+
+#[test]
+fn a_decision_that_does_not_count_ends_no_goal() {
+    let rules = GateRules {
+        operators: vec!["berta".to_owned()],
+        ..rules()
+    };
+    let mut executor = Executor::new(rules, None, None);
+    executor.on_heightmap(Duration::from_secs(5), empty());
+    goal(&mut executor, ID).unwrap();
+    let stranger = decide(&mut executor, ID, OperatorDecision::Reject);
+    assert_said(&stranger, StepOutcome::Refused, false, "does not decide");
+    let unreadable = executor.refuse(ID, "decision is 77".to_owned());
+    assert_said(&unreadable, StepOutcome::Refused, false, "77");
+    let decision = OperatorDecision::Approve;
+    let begun = executor.on_confirmation(ID, decision, "berta", &READY, NOW);
+    assert_eq!(begun, [begins(ID)]);
+}
+
+#[test]
+fn the_word_that_ends_a_goal_says_that_nothing_moves_for_it_any_more() {
+    let mut executor = asking();
+    goal(&mut executor, ID).unwrap();
+    let stopped = Robot {
+        obstacle: Some("safety mode is PROTECTIVE_STOP"),
+        ..READY
+    };
+    let decision = OperatorDecision::Approve;
+    let refused = executor.on_confirmation(ID, decision, "anna", &stopped, NOW);
+    assert_said(&refused, StepOutcome::Refused, true, "PROTECTIVE_STOP");
+    let status = said(&refused).report.status;
+    assert_eq!(status, Some(ProposalStatus::Withdrawn));
+    assert_eq!(status, executor.status(ID));
 }
 
 #[test]

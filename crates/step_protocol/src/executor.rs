@@ -504,9 +504,10 @@ impl Executor {
         {
             // Nothing moves for a goal that has ended.
             self.gate.withdraw(goal.id);
-            if !planted(Mutation::EndedGoalIsSaidPending) {
-                report.status = self.gate.status(goal.id);
-            }
+        }
+        // What came after this word, in the gate's answer too, may have changed it.
+        if !planted(Mutation::StatusIsOutdated) {
+            report.status = self.gate.final_status(report.id);
         }
         ExecutorAction::Say(Said {
             report,

@@ -43,8 +43,8 @@ pub(crate) enum Mutation {
     EndedGoalStaysPending,
     /// The proposal of a goal that a deactivation has ended can still be approved.
     DeactivatedGoalStaysPending,
-    /// The word that ends a goal says that its proposal can still be approved.
-    EndedGoalIsSaidPending,
+    /// A word says where its proposal stood before the rest of the same answer.
+    StatusIsOutdated,
     /// A decision that does not count ends a goal.
     UncountedDecisionEndsGoal,
     /// A motion goes on though its goal is cancelled.
@@ -71,12 +71,14 @@ pub(crate) enum Mutation {
     OtherGoalHidesProposal,
     /// A motion that the goal tracker does not know hides what is proposed after it from the page.
     UnknownMotionHidesProposal,
+    /// A motion that the goal tracker does not decide on hides from the page the one after it.
+    StaleMotionHidesNewer,
 }
 
 impl Mutation {
     /// All of them.
     #[cfg(test)]
-    pub(crate) const ALL: [Self; 34] = [
+    pub(crate) const ALL: [Self; 35] = [
         Self::ApprovalMovesTwice,
         Self::SupersededStaysPending,
         Self::WaitingSurvivesStop,
@@ -97,7 +99,7 @@ impl Mutation {
         Self::GoalMovesUnasked,
         Self::EndedGoalStaysPending,
         Self::DeactivatedGoalStaysPending,
-        Self::EndedGoalIsSaidPending,
+        Self::StatusIsOutdated,
         Self::UncountedDecisionEndsGoal,
         Self::CancelStopsNothing,
         Self::PutDownGoesHome,
@@ -111,6 +113,7 @@ impl Mutation {
         Self::ContinuedStaysStopped,
         Self::OtherGoalHidesProposal,
         Self::UnknownMotionHidesProposal,
+        Self::StaleMotionHidesNewer,
     ];
 }
 

@@ -417,10 +417,28 @@ impl Operator {
                     known.unknown_to_tracker = true;
                 }
             }
+            Some(RefusalKind::Stale) => self.on_stale(id),
             Some(RefusalKind::Stopped) => {
                 self.stopped = self.goal.as_ref().is_some_and(|goal| !goal.complete);
             }
             _ => {}
+        }
+    }
+
+    /// The goal tracker does not decide on this motion. Where the arm has moved once more for the present goal, that motion is the one.
+    fn on_stale(&mut self, id: ProposalId) {
+        let goal = self.goal.as_ref();
+        let moved_again = self.proposals.iter().any(|known| {
+            let is_moved =
+                matches!(known.standing, Standing::Moved(_)) && !known.unknown_to_tracker;
+            let is_of_goal = goal.is_some_and(|goal| is_for(&known.proposal, goal));
+            known.proposal.id != id && is_moved && is_of_goal
+        });
+        if let Some(known) = self.known_mut(id).filter(|_| moved_again)
+            && let Standing::Judged(_) = known.standing
+            && !planted(Mutation::StaleMotionHidesNewer)
+        {
+            known.standing = Standing::Closed;
         }
     }
 

@@ -290,6 +290,25 @@ fn after_a_stop_or_a_fault_nothing_goes_on_unasked_and_the_next_process_knows() 
 }
 
 #[test]
+fn what_waits_when_a_stop_comes_is_said_to_be_withdrawn() {
+    let mut executor = asking();
+    propose(&mut executor, ID);
+    let unrehearsed = Robot {
+        unrehearsed: true,
+        ..READY
+    };
+    let decision = OperatorDecision::Approve;
+    assert_eq!(
+        executor.on_confirmation(ID, decision, "anna", &unrehearsed, NOW),
+        []
+    );
+    let stopped = decide(&mut executor, OTHER, OperatorDecision::Stop);
+    assert_said(&stopped, StepOutcome::Refused, false, "a stop came");
+    let status = said(&stopped).report.status;
+    assert_eq!(status, Some(ProposalStatus::Withdrawn));
+}
+
+#[test]
 fn a_way_home_waits_for_its_approval_and_lets_nothing_go_on() {
     let mut executor = executor(RequireApproval::Always, None, Some("stop"));
     let home = executor.propose_recovery(ID, Recovery::Home, &READY, NOW);

@@ -71,8 +71,8 @@ pub(crate) enum Mutation {
     OtherGoalHidesProposal,
     /// A motion that the goal tracker does not know hides what is proposed after it from the page.
     UnknownMotionHidesProposal,
-    /// A motion that the goal tracker does not decide on hides from the page the one after it.
-    StaleMotionHidesNewer,
+    /// A motion that the goal tracker does not decide on hides others from the page.
+    StaleMotionHidesOthers,
 }
 
 impl Mutation {
@@ -113,7 +113,7 @@ impl Mutation {
         Self::ContinuedStaysStopped,
         Self::OtherGoalHidesProposal,
         Self::UnknownMotionHidesProposal,
-        Self::StaleMotionHidesNewer,
+        Self::StaleMotionHidesOthers,
     ];
 }
 

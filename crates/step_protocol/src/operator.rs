@@ -425,18 +425,22 @@ impl Operator {
         }
     }
 
-    /// The goal tracker does not decide on this motion. Where the arm has moved once more for the present goal, that motion is the one.
+    /// The goal tracker does not decide on this motion, and it hides neither a later one for the present goal nor what is proposed for
+    /// that.
     fn on_stale(&mut self, id: ProposalId) {
         let goal = self.goal.as_ref();
-        let moved_again = self.proposals.iter().any(|known| {
-            let is_moved =
-                matches!(known.standing, Standing::Moved(_)) && !known.unknown_to_tracker;
+        let has_other = self.proposals.iter().any(|known| {
+            let is_due = match known.standing {
+                Standing::Open => true,
+                Standing::Moved(_) => !known.unknown_to_tracker,
+                Standing::Approved | Standing::Closed | Standing::Judged(_) => false,
+            };
             let is_of_goal = goal.is_some_and(|goal| is_for(&known.proposal, goal));
-            known.proposal.id != id && is_moved && is_of_goal
+            known.proposal.id != id && is_due && is_of_goal
         });
-        if let Some(known) = self.known_mut(id).filter(|_| moved_again)
+        if let Some(known) = self.known_mut(id).filter(|_| has_other)
             && let Standing::Judged(_) = known.standing
-            && !planted(Mutation::StaleMotionHidesNewer)
+            && !planted(Mutation::StaleMotionHidesOthers)
         {
             known.standing = Standing::Closed;
         }

@@ -147,7 +147,7 @@ impl Action {
             94..96 => Self::Tick,
             96 => Self::SetStep(which),
             97 => Self::Obstacle(which % 3 == 0),
-            98..100 if other.is_multiple_of(3) => Self::Home(Recovery::PutDown),
+            98..100 if other.is_multiple_of(2) => Self::Home(Recovery::PutDown),
             98..100 => Self::Home(Recovery::Home),
             100..103 => Self::SendGoal(which),
             103 => Self::CancelGoal,

@@ -664,7 +664,7 @@ impl World {
             cell.forget_approvals();
             cell.stopped = true;
             cell.robot.joints += 1;
-            cell.robot.holds = way.is_multiple_of(2);
+            cell.robot.holds = true;
         } else {
             cell.robot.joints = 0;
             cell.robot.holds &= matches!(order, MotionOrder::Home(_));
@@ -733,11 +733,11 @@ impl World {
         }
     }
 
-    /// The pending proposal, where it is to be rehearsed. None is while the arm moves: it would begin elsewhere.
+    /// The pending proposal, where it is to be rehearsed. A rehearsal may end while the arm moves for what was pending before.
     pub(super) fn unrehearsed(&self) -> Option<ProposalId> {
         let cell = &self.cell;
         let pending = cell.executor.pending().map(|pending| pending.id);
-        pending.filter(|_| pending != cell.robot.rehearsed && cell.motion.is_none())
+        pending.filter(|_| pending != cell.robot.rehearsed)
     }
 
     pub(super) fn rehearse(&mut self) -> Check {

@@ -8,6 +8,7 @@ use std::time::Duration;
 use heightmap::Heightmap;
 
 use crate::action_goal::ActionGoal;
+use crate::mutation::{Mutation, planted};
 use crate::{
     ApprovalGate, CannotBegin, GateAction, GateRules, JointPositions, MotionCause, MotionEnd,
     MotionOrder, MotionTimes, MotionWord, Obstacle, OperatorDecision, Presence, Proposal,
@@ -141,8 +142,12 @@ impl Executor {
     /// The node becomes active: nobody was heard yet, and goals of before have ended.
     pub fn activate(&mut self) {
         self.presence = self.presence_timeout.map(Presence::new);
-        self.goal = None;
         self.motion = None;
+        if let Some(goal) = self.goal.take()
+            && !planted(Mutation::DeactivatedGoalStaysPending)
+        {
+            self.gate.withdraw(goal.id);
+        }
     }
 
     /// The node is deactivated: no approval from before may move anything later, and what moves is stopped.
@@ -216,7 +221,7 @@ impl Executor {
             Proposed::Pending if self.gate.moves_unasked(id) => self.approve(id, robot, now),
             // Nobody looks at it before.
             Proposed::Invalid(reason) if self.gate.is_automatic() => {
-                self.refuse(id, reason.to_string())
+                vec![self.say(self.refusal(id, reason.to_string()), None)]
             }
             Proposed::Pending | Proposed::Repeated | Proposed::Invalid(_) => Vec::new(),
         };
@@ -245,7 +250,8 @@ impl Executor {
             });
         }
         self.goal = Some(ActionGoal::new(id));
-        let mut actions = match self.gate.moves_unasked(id) {
+        let moves = self.gate.moves_unasked(id) || planted(Mutation::GoalMovesUnasked);
+        let mut actions = match moves {
             true => self.approve(id, robot, now),
             false => vec![ExecutorAction::AwaitApproval(id)],
         };
@@ -279,6 +285,9 @@ impl Executor {
         goal.is_cancelled = true;
         let ActionGoal { id, is_moving, .. } = *goal;
         if is_moving && self.motion.is_some() {
+            if planted(Mutation::CancelStopsNothing) {
+                return Vec::new();
+            }
             return self.stop(StopCause::GoalCancelled);
         }
         self.gate.withdraw(id);
@@ -299,15 +308,25 @@ impl Executor {
         robot: &impl RobotState,
         now: Duration,
     ) -> Vec<ExecutorAction> {
-        if let Err(refusal) = self.gate.check_operator(id, decision, operator_name) {
+        if let Err(refusal) = self.gate.check_operator(id, decision, operator_name)
+            && !planted(Mutation::StrangerDecides)
+        {
             return self.refuse(id, refusal.to_string());
         }
         self.confirm(id, decision, robot, now)
     }
 
-    /// Refuses what was said of a proposal.
+    /// Refuses what was said of a proposal. It counts for nothing: no goal ends with it.
     pub fn refuse(&mut self, id: ProposalId, reason: String) -> Vec<ExecutorAction> {
-        vec![self.say(self.refusal(id, reason), None)]
+        let report = self.refusal(id, reason);
+        if planted(Mutation::UncountedDecisionEndsGoal) {
+            return vec![self.say(report, None)];
+        }
+        vec![ExecutorAction::Say(Said {
+            report,
+            motion: None,
+            ends_goal: false,
+        })]
     }
 
     /// Proposes what brings the arm home; `new` is for a new proposal.
@@ -341,7 +360,8 @@ impl Executor {
         if is_proposal && let Some(goal) = &mut self.goal {
             goal.is_moving = goal.id == cause.id();
         }
-        self.stops.begin(cause.name(), is_proposal);
+        let lets_go_on = is_proposal || planted(Mutation::HomeClearsStop);
+        self.stops.begin(cause.name(), lets_go_on);
         self.motion = Some(Motion {
             cause,
             stopped: None,
@@ -369,7 +389,8 @@ impl Executor {
             self.stops.stop(reason);
         }
         self.stops.end();
-        let answers = self.gate.finish(times.until, is_broken_off);
+        let is_stop = is_broken_off && !planted(Mutation::FaultIsNoStop);
+        let answers = self.gate.finish(times.until, is_stop);
         let id = cause.id();
         let report = Report {
             id,
@@ -385,16 +406,17 @@ impl Executor {
 
     fn attended<'a, R: RobotState>(&self, robot: &'a R, now: Duration) -> Attended<'a, R> {
         let presence = self.presence.as_ref();
+        let is_absent = presence.is_some_and(|presence| !presence.is_present(now));
         Attended {
             robot,
-            is_absent: presence.is_some_and(|presence| !presence.is_present(now)),
+            is_absent: is_absent && !planted(Mutation::MovesUnattended),
         }
     }
 
     /// When the motion under way is to stop because nobody is present.
     fn absence(&self) -> Option<Duration> {
         let presence = self.presence.as_ref()?;
-        let is_watched = self.motion?.stopped.is_none();
+        let is_watched = self.motion?.stopped.is_none() && !planted(Mutation::AbsenceStopsNothing);
         is_watched.then(|| presence.deadline().unwrap_or(Duration::ZERO))
     }
 
@@ -428,7 +450,7 @@ impl Executor {
         robot: &impl RobotState,
         now: Duration,
     ) -> Vec<ExecutorAction> {
-        if decision == OperatorDecision::Stop {
+        if decision == OperatorDecision::Stop && !planted(Mutation::StopIsNotRecorded) {
             self.stops
                 .stop(format!("{} of proposal {id}", decision.name()));
         }
@@ -445,6 +467,9 @@ impl Executor {
                     actions.push(self.begin(MotionOrder::Proposal(proposal)));
                 }
                 GateAction::GoHome(id) => actions.push(self.begin(MotionOrder::Home(id))),
+                GateAction::PutDown(id) if planted(Mutation::PutDownGoesHome) => {
+                    actions.push(self.begin(MotionOrder::Home(id)));
+                }
                 GateAction::PutDown(id) => actions.push(self.begin(MotionOrder::PutDown(id))),
                 GateAction::Cancel => actions.extend(self.stop(StopCause::Operator)),
                 GateAction::Report(report) => actions.push(self.say(report, None)),
@@ -465,18 +490,24 @@ impl Executor {
             id,
             outcome: StepOutcome::Refused,
             reason,
-            status: self.gate.status(id),
+            status: self.gate.final_status(id),
         }
     }
 
-    fn say(&mut self, report: Report, motion: Option<MotionTimes>) -> ExecutorAction {
+    fn say(&mut self, mut report: Report, motion: Option<MotionTimes>) -> ExecutorAction {
         let is_of_motion = motion.is_some();
         let ended = self
             .goal
             .take_if(|goal| goal.ends_with(report.id, is_of_motion));
-        if let Some(goal) = ended {
+        if let Some(goal) = ended
+            && !planted(Mutation::EndedGoalStaysPending)
+        {
             // Nothing moves for a goal that has ended.
             self.gate.withdraw(goal.id);
+        }
+        // What came after this word, in the gate's answer too, may have changed it.
+        if !planted(Mutation::StatusIsOutdated) {
+            report.status = self.gate.final_status(report.id);
         }
         ExecutorAction::Say(Said {
             report,

@@ -25,6 +25,32 @@ pub(crate) enum Mutation {
     HomeSurvivesMotion,
     /// Any approval moves the arm home where a way home is proposed.
     AnyApprovalMovesHome,
+    /// The executor does not keep a stop for the next process.
+    StopIsNotRecorded,
+    /// A way home lets things go on in the next process.
+    HomeClearsStop,
+    /// After a fault things go on by themselves.
+    FaultIsNoStop,
+    /// A motion begins though no operator is present.
+    MovesUnattended,
+    /// A motion goes on when the operator goes away.
+    AbsenceStopsNothing,
+    /// Everybody decides, whoever the operators are.
+    StrangerDecides,
+    /// A goal of the executor's action moves without an approval.
+    GoalMovesUnasked,
+    /// The proposal of a goal that has ended can still be approved.
+    EndedGoalStaysPending,
+    /// The proposal of a goal that a deactivation has ended can still be approved.
+    DeactivatedGoalStaysPending,
+    /// A word says where its proposal stood before the rest of the same answer.
+    StatusIsOutdated,
+    /// A decision that does not count ends a goal.
+    UncountedDecisionEndsGoal,
+    /// A motion goes on though its goal is cancelled.
+    CancelStopsNothing,
+    /// The arm goes home with what it was to put down.
+    PutDownGoesHome,
     /// A decision that waits for its result is lost when another proposal comes.
     SupersessionDropsDecision,
     /// A decision counts before the arm has moved.
@@ -43,12 +69,16 @@ pub(crate) enum Mutation {
     ContinuedStaysStopped,
     /// A proposal for another goal hides that for the present one from the page.
     OtherGoalHidesProposal,
+    /// A motion that the goal tracker does not know hides what is proposed after it from the page.
+    UnknownMotionHidesProposal,
+    /// A motion that the goal tracker does not decide on hides others from the page.
+    StaleMotionHidesOthers,
 }
 
 impl Mutation {
     /// All of them.
     #[cfg(test)]
-    pub(crate) const ALL: [Self; 20] = [
+    pub(crate) const ALL: [Self; 35] = [
         Self::ApprovalMovesTwice,
         Self::SupersededStaysPending,
         Self::WaitingSurvivesStop,
@@ -60,6 +90,19 @@ impl Mutation {
         Self::HomeSurvivesStop,
         Self::HomeSurvivesMotion,
         Self::AnyApprovalMovesHome,
+        Self::StopIsNotRecorded,
+        Self::HomeClearsStop,
+        Self::FaultIsNoStop,
+        Self::MovesUnattended,
+        Self::AbsenceStopsNothing,
+        Self::StrangerDecides,
+        Self::GoalMovesUnasked,
+        Self::EndedGoalStaysPending,
+        Self::DeactivatedGoalStaysPending,
+        Self::StatusIsOutdated,
+        Self::UncountedDecisionEndsGoal,
+        Self::CancelStopsNothing,
+        Self::PutDownGoesHome,
         Self::SupersessionDropsDecision,
         Self::AdvanceWithoutMotion,
         Self::ResultCountsTwice,
@@ -69,6 +112,8 @@ impl Mutation {
         Self::UnansweredIsForgotten,
         Self::ContinuedStaysStopped,
         Self::OtherGoalHidesProposal,
+        Self::UnknownMotionHidesProposal,
+        Self::StaleMotionHidesOthers,
     ];
 }
 

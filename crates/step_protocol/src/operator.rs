@@ -257,7 +257,9 @@ impl Operator {
         let of_goal = || self.proposals.iter().rev().filter(of_goal);
         let is_at_work = |known: &&Known| match known.standing {
             Standing::Approved | Standing::Judged(_) => true,
-            Standing::Moved(_) => !known.unknown_to_tracker,
+            Standing::Moved(_) => {
+                !known.unknown_to_tracker || planted(Mutation::UnknownMotionHidesProposal)
+            }
             Standing::Open | Standing::Closed => false,
         };
         let is_unanswered = |known: &&Known| {
@@ -415,10 +417,32 @@ impl Operator {
                     known.unknown_to_tracker = true;
                 }
             }
+            Some(RefusalKind::Stale) => self.on_stale(id),
             Some(RefusalKind::Stopped) => {
                 self.stopped = self.goal.as_ref().is_some_and(|goal| !goal.complete);
             }
             _ => {}
+        }
+    }
+
+    /// The goal tracker does not decide on this motion, and it hides neither a later one for the present goal nor what is proposed for
+    /// that.
+    fn on_stale(&mut self, id: ProposalId) {
+        let goal = self.goal.as_ref();
+        let has_other = self.proposals.iter().any(|known| {
+            let is_due = match known.standing {
+                Standing::Open => true,
+                Standing::Moved(_) => !known.unknown_to_tracker,
+                Standing::Approved | Standing::Closed | Standing::Judged(_) => false,
+            };
+            let is_of_goal = goal.is_some_and(|goal| is_for(&known.proposal, goal));
+            known.proposal.id != id && is_due && is_of_goal
+        });
+        if let Some(known) = self.known_mut(id).filter(|_| has_other)
+            && let Standing::Judged(_) = known.standing
+            && !planted(Mutation::StaleMotionHidesOthers)
+        {
+            known.standing = Standing::Closed;
         }
     }
 

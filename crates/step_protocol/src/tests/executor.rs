@@ -193,6 +193,9 @@ fn the_goals_of_an_active_state_end_with_it() {
     assert_eq!(executor.deactivate(StopCause::Deactivated), []);
     executor.activate();
     assert_eq!(executor.on_goal_cancel(), []);
+    // Its client has heard that it has ended.
+    assert_eq!(executor.status(ID), Some(ProposalStatus::Withdrawn));
+    assert!(!moves_anything(&approve(&mut executor, ID)));
     goal(&mut executor, OTHER).unwrap();
     approve(&mut executor, OTHER);
     let stopped = executor.deactivate(StopCause::Shutdown);
@@ -287,6 +290,25 @@ fn after_a_stop_or_a_fault_nothing_goes_on_unasked_and_the_next_process_knows() 
 }
 
 #[test]
+fn what_waits_when_a_stop_comes_is_said_to_be_withdrawn() {
+    let mut executor = asking();
+    propose(&mut executor, ID);
+    let unrehearsed = Robot {
+        unrehearsed: true,
+        ..READY
+    };
+    let decision = OperatorDecision::Approve;
+    assert_eq!(
+        executor.on_confirmation(ID, decision, "anna", &unrehearsed, NOW),
+        []
+    );
+    let stopped = decide(&mut executor, OTHER, OperatorDecision::Stop);
+    assert_said(&stopped, StepOutcome::Refused, false, "a stop came");
+    let status = said(&stopped).report.status;
+    assert_eq!(status, Some(ProposalStatus::Withdrawn));
+}
+
+#[test]
 fn a_way_home_waits_for_its_approval_and_lets_nothing_go_on() {
     let mut executor = executor(RequireApproval::Always, None, Some("stop"));
     let home = executor.propose_recovery(ID, Recovery::Home, &READY, NOW);
@@ -344,6 +366,40 @@ fn a_decision_of_somebody_who_does_not_decide_moves_nothing() {
     let decision = OperatorDecision::Approve;
     let begun = executor.on_confirmation(ID, decision, "berta", &READY, NOW);
     assert_eq!(begun, [begins(ID)]);
+}
+
+#[test]
+fn a_decision_that_does_not_count_ends_no_goal() {
+    let rules = GateRules {
+        operators: vec!["berta".to_owned()],
+        ..rules()
+    };
+    let mut executor = Executor::new(rules, None, None);
+    executor.on_heightmap(Duration::from_secs(5), empty());
+    goal(&mut executor, ID).unwrap();
+    let stranger = decide(&mut executor, ID, OperatorDecision::Reject);
+    assert_said(&stranger, StepOutcome::Refused, false, "does not decide");
+    let unreadable = executor.refuse(ID, "decision is 77".to_owned());
+    assert_said(&unreadable, StepOutcome::Refused, false, "77");
+    let decision = OperatorDecision::Approve;
+    let begun = executor.on_confirmation(ID, decision, "berta", &READY, NOW);
+    assert_eq!(begun, [begins(ID)]);
+}
+
+#[test]
+fn the_word_that_ends_a_goal_says_that_nothing_moves_for_it_any_more() {
+    let mut executor = asking();
+    goal(&mut executor, ID).unwrap();
+    let stopped = Robot {
+        obstacle: Some("safety mode is PROTECTIVE_STOP"),
+        ..READY
+    };
+    let decision = OperatorDecision::Approve;
+    let refused = executor.on_confirmation(ID, decision, "anna", &stopped, NOW);
+    assert_said(&refused, StepOutcome::Refused, true, "PROTECTIVE_STOP");
+    let status = said(&refused).report.status;
+    assert_eq!(status, Some(ProposalStatus::Withdrawn));
+    assert_eq!(status, executor.status(ID));
 }
 
 #[test]

@@ -558,6 +558,37 @@ fn a_motion_that_the_tracker_does_not_know_hides_no_other_proposal() {
 }
 
 #[test]
+fn where_the_arm_has_moved_once_more_the_page_asks_about_that_motion() {
+    let mut operator = at_page();
+    operator.on_result(placed(7));
+    // Nobody was asked before it moved.
+    operator.on_proposal(proposal(8, 10));
+    operator.on_result(placed(8));
+    // The first one is published again.
+    operator.on_proposal(proposal(7, 10));
+    assert_eq!(current(&operator), Some(7));
+    operator.decide(&says(OperatorDecision::Advance, 7), NOW);
+    operator.on_confirmation_refused(ProposalId(7), Some(RefusalKind::Stale));
+    assert_eq!(
+        (operator.phase(), current(&operator)),
+        (RunPhase::AwaitingConfirmation, Some(8))
+    );
+}
+
+#[test]
+fn a_motion_that_the_tracker_does_not_decide_on_hides_no_proposal() {
+    let mut operator = at_page();
+    operator.on_result(placed(7));
+    operator.on_proposal(proposal(8, 30));
+    operator.decide(&says(OperatorDecision::Advance, 7), NOW);
+    operator.on_confirmation_refused(ProposalId(7), Some(RefusalKind::Stale));
+    assert_eq!(
+        (operator.phase(), current(&operator)),
+        (RunPhase::Proposed, Some(8))
+    );
+}
+
+#[test]
 fn where_the_same_goal_comes_again_nothing_decided_before_holds_the_run_up() {
     let mut operator = at_page();
     let second = Goal {

@@ -1,7 +1,10 @@
-//! All four machines together under random schedules: messages delayed, repeated, reordered and lost, garbage in between, any
-//! party started again, two operators, each a program that answers questions or a person at a page, stops and faults.
+//! All machines together under random schedules: messages delayed, repeated, reordered and lost, garbage in between, any
+//! party started again, two operators, each a program that answers questions or a person at a page, goals of the executor's action, stops
+//! and faults.
 //!
 //! `SCHEDULES=1000000 SEED=7 cargo test --release -p step_protocol schedules -- --nocapture`
+
+mod executor_side;
 
 use std::collections::{BTreeMap, BTreeSet, VecDeque};
 use std::fmt;
@@ -16,13 +19,12 @@ use rand_chacha::ChaCha8Rng;
 
 use crate::mutation::{Mutation, plant};
 use crate::{
-    ApprovalGate, CannotBegin, Change, Confirmation, ConfirmationRefusal, Coverage, GateAction,
-    GateRules, Goal, GoalSequence, GoalTracker, Job, JointPositions, Judgement, Observation,
-    Obstacle, Operator, OperatorDecision, PlannerRules, Prediction, Proposal, ProposalId,
-    ProposalPlanner, ProposalStatus, Proposed, Question, Recovery, RefusalKind, RefusalReason,
-    RequireApproval, Reward, RobotState, RunPhase, ShownStep, StepJudge, StepOutcome, StepResult,
-    goals_of,
+    Change, Confirmation, ConfirmationRefusal, Coverage, Goal, GoalSequence, GoalTracker, Job,
+    Judgement, Observation, Operator, OperatorDecision, PlannerRules, Prediction, Proposal,
+    ProposalId, ProposalPlanner, ProposalStatus, Question, Recovery, RefusalKind, RequireApproval,
+    Reward, RunPhase, ShownStep, StepJudge, StepOutcome, StepResult, goals_of,
 };
+use executor_side::ExecutorSide;
 
 const WORKSPACE: Workspace = Workspace {
     origin_m: Point2::new(0.25, -0.2),
@@ -46,14 +48,14 @@ const QUIET_MOMENTS: usize = 200;
 enum Party {
     Tracker,
     Planner,
-    Gate,
+    Executor,
     Operator(usize),
 }
 
 const PARTIES: [Party; 5] = [
     Party::Tracker,
     Party::Planner,
-    Party::Gate,
+    Party::Executor,
     Party::Operator(0),
     Party::Operator(1),
 ];
@@ -68,6 +70,10 @@ enum Message {
     ConfirmationRefused(ProposalId, RefusalKind),
     Result(StepResult),
     Reward(Reward),
+    /// A decision on this proposal that cannot be read.
+    UnreadableConfirmation(ProposalId),
+    /// Whether an operator is present.
+    Presence(bool),
 }
 
 /// One thing that happens. Numbers are taken modulo what there is to choose from, so that any part of a schedule is one.
@@ -83,8 +89,8 @@ enum Action {
     Lose(usize, usize),
     /// A party is killed and started again.
     Restart(usize),
-    /// The executor is deactivated and activated.
-    Deactivate,
+    /// The executor is deactivated and activated; what moves ends so.
+    Deactivate(usize),
     /// The network answers.
     Predict,
     /// The executor has rehearsed the pending proposal.
@@ -105,8 +111,16 @@ enum Action {
     SetStep(usize),
     /// The robot is ready or not.
     Obstacle(bool),
-    /// Somebody calls for the way home.
-    Home,
+    /// Somebody calls for the way home, or to put down what is held.
+    Home(Recovery),
+    /// A client of the executor's action sends a goal, good or not.
+    SendGoal(usize),
+    /// It wants its goal cancelled.
+    CancelGoal,
+    /// The operator comes or goes.
+    Presence(bool),
+    /// A decision cannot be read.
+    Garble(usize),
 }
 
 impl Action {
@@ -116,13 +130,13 @@ impl Action {
         let party = number(&mut next);
         let which = number(&mut next);
         let other = number(&mut next);
-        match next() % 100 {
+        match next() % 106 {
             0..45 => Self::Deliver(party),
             45..50 => Self::Overtake(party, which),
             50..54 => Self::Repeat(party, which),
             54..57 => Self::Lose(party, which),
             57..60 => Self::Restart(party),
-            60 => Self::Deactivate,
+            60 => Self::Deactivate(which),
             61..67 => Self::Predict,
             67..70 => Self::Rehearse,
             70..77 => Self::EndMotion(which),
@@ -133,7 +147,12 @@ impl Action {
             94..96 => Self::Tick,
             96 => Self::SetStep(which),
             97 => Self::Obstacle(which % 3 == 0),
-            _ => Self::Home,
+            98..100 if other.is_multiple_of(2) => Self::Home(Recovery::PutDown),
+            98..100 => Self::Home(Recovery::Home),
+            100..103 => Self::SendGoal(which),
+            103 => Self::CancelGoal,
+            104 => Self::Presence(!which.is_multiple_of(4)),
+            _ => Self::Garble(which),
         }
     }
 }
@@ -154,43 +173,12 @@ fn violation<T>(text: impl Into<String>) -> Result<T, Violation> {
     Err(Violation(text.into()))
 }
 
-struct Robot {
-    ready: bool,
-    /// Where the arm is: 0 at home, where motions begin and end, something else where one was broken off.
-    joints: u32,
-    /// The proposal whose motion was rehearsed from there.
-    rehearsed: Option<ProposalId>,
-}
-
-impl RobotState for Robot {
-    fn obstacle(&self) -> Option<Obstacle> {
-        (!self.ready).then(|| RefusalReason::SafetyMode.because("is PROTECTIVE_STOP"))
-    }
-
-    fn check_motion(&self, proposal: &Proposal) -> Result<(), CannotBegin> {
-        match self.rehearsed == Some(proposal.id) {
-            true => Ok(()),
-            false => Err(CannotBegin::NotRehearsed),
-        }
-    }
-
-    fn check_recovery(&self, _: Recovery) -> Result<JointPositions, CannotBegin> {
-        Ok(JointPositions::repeat(f64::from(self.joints)))
-    }
-}
-
-/// What moves the arm.
-#[derive(Clone, Debug, PartialEq)]
-enum Motion {
-    Proposal(Box<Proposal>),
-    Home(ProposalId),
-}
-
 /// The whole graph, and what is known of it from outside.
 struct World {
     tracker: GoalTracker,
     planner: ProposalPlanner,
-    gate: ApprovalGate,
+    /// The executor's node and the arm.
+    cell: ExecutorSide,
     operators: [Operator; 2],
     /// Which of them are people at a page.
     at_page: [bool; 2],
@@ -198,7 +186,6 @@ struct World {
     refused: [BTreeSet<ProposalId>; 2],
     inboxes: [VecDeque<Message>; 5],
     job: Option<Job>,
-    robot: Robot,
     /// Monotonic time.
     now: Duration,
     /// Whether stamps advance while nothing moves, as on a real cell.
@@ -207,22 +194,11 @@ struct World {
     /// The newest of each latched topic, for parties that start.
     latched_goal: Option<Goal>,
     latched_proposals: [Option<Proposal>; 2],
-    motion: Option<Motion>,
-    cancelled: bool,
-    /// The way home that may be approved: the newest, until a stop, a motion, a deactivation or a restart.
-    home: Option<ProposalId>,
-    /// Every way home that was proposed.
-    homes: Vec<ProposalId>,
     /// Everything that was published under an id.
     published: BTreeMap<ProposalId, Vec<Proposal>>,
     foreign_count: u64,
     /// Proposals that the arm has moved for.
     moved: BTreeSet<ProposalId>,
-    /// Of these, those since the executor was started.
-    moved_since_start: BTreeSet<ProposalId>,
-    /// Approvals that the executor has received and that still count.
-    approvals: Vec<ProposalId>,
-    newest_at_gate: Option<ProposalId>,
     /// Decisions that the tracker has accepted and that have not counted yet.
     queued: BTreeMap<ProposalId, Judgement>,
     /// Decisions that have counted at this tracker.
@@ -257,17 +233,6 @@ fn planner() -> ProposalPlanner {
     })
 }
 
-fn gate() -> ApprovalGate {
-    ApprovalGate::new(GateRules {
-        frame: "world".into(),
-        limits: PrimitiveSettings::RIGID,
-        changes: ChangeRules::default(),
-        confirmation_grace: GRACE,
-        require_approval: RequireApproval::Always,
-        operators: Vec::new(),
-    })
-}
-
 fn heightmap(height_m: f32) -> Arc<Heightmap> {
     let mut heightmap = Heightmap::new(WORKSPACE);
     heightmap.rgb.fill(100);
@@ -293,32 +258,28 @@ fn predict(job: &Job) -> Result<Prediction, String> {
         place: Isometry2::new(Vector2::new(0.5, -0.1), 1.0),
         pick_score: 1.0,
         place_score: 1.0,
-        success_probability: None,
+        // The policy is sure of its first thought.
+        success_probability: Some(if job.exclude.is_empty() { 0.9 } else { 0.3 }),
         done_probability: None,
     })
 }
 
 impl World {
-    fn new(
-        Setting {
+    fn new(setting: Setting) -> Self {
+        let Setting {
             clock_runs,
             at_page,
-        }: Setting,
-    ) -> Self {
+            ..
+        } = setting;
         let mut world = Self {
             tracker: tracker(),
             planner: planner(),
-            gate: gate(),
+            cell: ExecutorSide::new(setting),
             operators: at_page.map(|at_page| Operator::new(!at_page)),
             at_page,
             refused: Default::default(),
             inboxes: Default::default(),
             job: None,
-            robot: Robot {
-                ready: true,
-                joints: 0,
-                rehearsed: None,
-            },
             now: Duration::ZERO,
             clock_runs,
             seen: Observation {
@@ -329,16 +290,9 @@ impl World {
             },
             latched_goal: None,
             latched_proposals: [None, None],
-            motion: None,
-            cancelled: false,
-            home: None,
-            homes: Vec::new(),
             published: BTreeMap::new(),
             foreign_count: 0,
             moved: BTreeSet::new(),
-            moved_since_start: BTreeSet::new(),
-            approvals: Vec::new(),
-            newest_at_gate: None,
             queued: BTreeMap::new(),
             counted: BTreeSet::new(),
             approved_at_planner: None,
@@ -347,19 +301,21 @@ impl World {
         };
         world.publish_goal();
         world.publish(Message::Heightmap(world.seen.clone()));
+        world.publish(Message::Presence(true));
         world
     }
 
     fn publish(&mut self, message: Message) {
-        use Party::{Gate, Operator, Planner, Tracker};
+        use Party::{Executor, Operator, Planner, Tracker};
         let to: &[Party] = match &message {
-            Message::Heightmap(_) => &[Planner, Gate],
+            Message::Heightmap(_) => &[Planner, Executor],
             Message::Goal(_) => &[Planner, Operator(0), Operator(1)],
-            Message::Proposal(..) => &[Tracker, Gate, Operator(0), Operator(1)],
-            Message::Confirmation(_) => &[Tracker, Planner, Gate, Operator(0), Operator(1)],
+            Message::Proposal(..) => &[Tracker, Executor, Operator(0), Operator(1)],
+            Message::Confirmation(_) => &[Tracker, Planner, Executor, Operator(0), Operator(1)],
             Message::ConfirmationRefused(..) => &[Operator(0), Operator(1)],
             Message::Result(_) => &[Tracker, Planner, Operator(0), Operator(1)],
             Message::Reward(_) => &[Operator(0), Operator(1)],
+            Message::UnreadableConfirmation(_) | Message::Presence(_) => &[Executor],
         };
         for party in to {
             self.send(*party, message.clone());
@@ -399,7 +355,7 @@ impl World {
                 .into_iter()
                 .chain([heightmap])
                 .for_each(|message| self.send(party, message)),
-            Party::Gate => proposals
+            Party::Executor => proposals
                 .chain([heightmap])
                 .for_each(|message| self.send(party, message)),
             Party::Operator(_) => goal
@@ -424,19 +380,7 @@ impl World {
                 self.approved_at_planner = None;
                 self.own_proposal = None;
             }
-            Party::Gate => {
-                // The watchdog stops the arm; nobody reports a result.
-                self.gate = gate();
-                self.robot.rehearsed = None;
-                self.moved_since_start.clear();
-                self.approvals.clear();
-                self.newest_at_gate = None;
-                self.home = None;
-                if self.motion.take().is_some() {
-                    self.robot.joints += 1;
-                    self.move_scene(0.0);
-                }
-            }
+            Party::Executor => self.restart_executor(),
             Party::Operator(index) => {
                 self.operators[index] = Operator::new(!self.at_page[index]);
                 self.refused[index].clear();
@@ -456,7 +400,7 @@ impl World {
         match party {
             Party::Tracker => self.tracker_receives(message),
             Party::Planner => self.planner_receives(message),
-            Party::Gate => self.gate_receives(message),
+            Party::Executor => self.executor_receives(message),
             Party::Operator(index) => {
                 if let Message::Result(result) = &message
                     && result.outcome == StepOutcome::Refused
@@ -514,7 +458,7 @@ impl World {
     /// The page asks again by itself what was not answered.
     fn refresh(&mut self, index: usize) {
         let operator = &mut self.operators[index];
-        if self.motion.is_some() {
+        if self.cell.motion.is_some() {
             operator.on_motion(self.now);
         }
         operator.ask_again(self.now);
@@ -531,7 +475,7 @@ impl World {
         };
         // In the end the person wants another one than one that was refused.
         let is_good = !(self.fair && self.refused[index].contains(&id));
-        let is_planned = self.robot.rehearsed == Some(id) && is_good;
+        let is_planned = self.cell.robot.rehearsed == Some(id) && is_good;
         let decision = match (operator.phase(), whim % 8) {
             (RunPhase::Proposed, 1) => OperatorDecision::Reject,
             (RunPhase::Proposed | RunPhase::Moving, 2) => OperatorDecision::Stop,
@@ -707,10 +651,7 @@ impl World {
 
     fn take_job(&mut self, job: Option<Job>) -> Check {
         if let Some(job) = job {
-            let moving = match &self.motion {
-                Some(Motion::Proposal(proposal)) => Some(proposal.id),
-                _ => None,
-            };
+            let moving = self.cell.moving();
             if moving.is_some() && moving == self.approved_at_planner {
                 return violation("the planner plans anew while its approved proposal moves");
             }
@@ -744,194 +685,11 @@ impl World {
         self.publish(Message::Proposal(proposal.id, Ok(proposal)));
     }
 
-    fn gate_receives(&mut self, message: Message) -> Check {
-        match message {
-            Message::Heightmap(observation) => {
-                let Observation {
-                    stamp, heightmap, ..
-                } = observation;
-                self.gate.on_heightmap(stamp, heightmap);
-                self.ask_gate()
-            }
-            Message::Proposal(id, proposal) => {
-                if self.gate.on_proposal(id, proposal) == Proposed::Pending {
-                    // No approval survives a supersession.
-                    let superseded = self.newest_at_gate.replace(id);
-                    self.approvals
-                        .retain(|approved| Some(*approved) != superseded);
-                }
-                self.ask_gate()
-            }
-            Message::Confirmation(confirmation) => {
-                let id = confirmation.proposal_id;
-                match confirmation.decision {
-                    OperatorDecision::Approve => self.approvals.push(id),
-                    OperatorDecision::Stop => {
-                        self.approvals.clear();
-                        self.home = None;
-                    }
-                    OperatorDecision::Reject => {
-                        self.home.take_if(|home| *home == id);
-                    }
-                    _ => {}
-                }
-                let decision = confirmation.decision;
-                let gate = &mut self.gate;
-                let actions = gate.on_confirmation(id, decision, &self.robot, self.now);
-                self.act(actions)
-            }
-            _ => Ok(()),
-        }
-    }
-
-    fn ask_gate(&mut self) -> Check {
-        let actions = self.gate.on_news(&self.robot, self.now);
-        self.act(actions)
-    }
-
-    fn act(&mut self, actions: Vec<GateAction>) -> Check {
-        for action in actions {
-            match action {
-                GateAction::Move(proposal) => {
-                    let id = proposal.id;
-                    if self.motion.is_some() {
-                        return violation(format!("{id} moves while the arm moves"));
-                    }
-                    let approval = self.approvals.iter().position(|approved| *approved == id);
-                    match approval {
-                        Some(index) => drop(self.approvals.swap_remove(index)),
-                        None => return violation(format!("{id} moves without an approval")),
-                    }
-                    let published = self.published.get(&id);
-                    if !published.is_some_and(|published| published.contains(&proposal)) {
-                        return violation(format!("{id} moves otherwise than it was published"));
-                    }
-                    if self.robot.rehearsed != Some(id) {
-                        return violation(format!("{id} moves and was not rehearsed"));
-                    }
-                    if !self.moved_since_start.insert(id) {
-                        return violation(format!("{id} moves twice"));
-                    }
-                    self.moved.insert(id);
-                    self.home = None;
-                    self.cancelled = false;
-                    self.motion = Some(Motion::Proposal(proposal));
-                }
-                GateAction::GoHome(id) | GateAction::PutDown(id) => {
-                    if self.motion.is_some() {
-                        return violation(format!("{id} moves the arm home while it moves"));
-                    }
-                    let approval = self.approvals.iter().position(|approved| *approved == id);
-                    match approval {
-                        Some(index) => drop(self.approvals.swap_remove(index)),
-                        None => return violation(format!("{id} moves home without an approval")),
-                    }
-                    if self.home.take() != Some(id) {
-                        return violation(format!("{id} moves home after it was withdrawn"));
-                    }
-                    self.cancelled = false;
-                    self.motion = Some(Motion::Home(id));
-                }
-                GateAction::Cancel => {
-                    if self.motion.is_none() {
-                        return violation("a cancel while nothing moves");
-                    }
-                    self.cancelled = true;
-                }
-                GateAction::Report(report) => {
-                    let mut approvals = self.approvals.iter();
-                    let answered = approvals.position(|approved| *approved == report.id);
-                    if let Some(index) = answered.filter(|_| report.outcome == StepOutcome::Refused)
-                    {
-                        self.approvals.swap_remove(index);
-                    }
-                    let result = StepResult {
-                        stamp: self.seen.stamp,
-                        proposal_id: report.id,
-                        outcome: report.outcome,
-                        reason: report.reason,
-                        duration: Duration::ZERO,
-                        status: report.status,
-                    };
-                    self.publish(Message::Result(result));
-                }
-            }
-        }
-        Ok(())
-    }
-
-    /// The scene after a motion: time has gone on, and something may have changed.
-    fn move_scene(&mut self, change_m: f32) {
-        self.seen.stamp += Duration::from_secs(1);
-        if change_m != 0.0 {
-            self.seen.heightmap = heightmap(self.seen.heightmap.height_m[0] + change_m);
-        }
-    }
-
-    fn end_motion(&mut self, outcome: StepOutcome, delta_reward: f64) -> Check {
-        let Some(motion) = self.motion.take() else {
-            return Ok(());
-        };
-        let outcome = match self.cancelled {
-            true => StepOutcome::Stopped,
-            false => outcome,
-        };
-        self.robot.rehearsed = None;
-        let changes = outcome == StepOutcome::Placed || delta_reward != 0.0;
-        self.move_scene(if changes { 0.1 } else { 0.0 });
-        let end = self.seen.stamp;
-        let broken_off = matches!(outcome, StepOutcome::Stopped | StepOutcome::Fault);
-        if broken_off {
-            self.approvals.clear();
-            self.robot.joints += 1;
-        } else {
-            self.robot.joints = 0;
-        }
-        let actions = self.gate.finish(end, broken_off);
-        if let Motion::Home(id) = motion {
-            let outcome = match broken_off {
-                true => StepOutcome::NotHome,
-                false => StepOutcome::AtHome,
-            };
-            let status = self.gate.status(id);
-            self.publish(Message::Result(StepResult {
-                stamp: end,
-                proposal_id: id,
-                outcome,
-                reason: String::new(),
-                duration: Duration::from_secs(1),
-                status,
-            }));
-        } else if let Motion::Proposal(proposal) = motion {
-            let status = self.gate.status(proposal.id);
-            self.publish(Message::Result(StepResult {
-                stamp: end,
-                proposal_id: proposal.id,
-                outcome,
-                reason: String::new(),
-                duration: Duration::from_secs(1),
-                status,
-            }));
-            if outcome.motion().is_some() {
-                let complete = self.fair && proposal.step as usize == GOALS;
-                self.publish(Message::Reward(Reward {
-                    stamp: end,
-                    delta: delta_reward,
-                    total: 0.0,
-                    complete,
-                }));
-            }
-        }
-        self.publish(Message::Heightmap(self.seen.clone()));
-        self.act(actions)?;
-        self.ask_gate()
-    }
-
-    /// Somebody else's proposal: for this goal or another one, good or not.
-    fn foreign(&mut self, kind: usize) {
+    /// A good proposal of somebody else.
+    fn proposal_of_somebody(&mut self) -> Proposal {
         self.foreign_count += 1;
         let (step, _, attempt) = self.tracker.progress();
-        let template = Proposal {
+        Proposal {
             id: ProposalId(1000 + self.foreign_count),
             frame: "world".into(),
             stamp: self.seen.stamp,
@@ -950,7 +708,32 @@ impl World {
             done_probability: None,
             checkpoint: String::new(),
             author: "somebody".into(),
-        };
+        }
+    }
+
+    /// The planner's proposal again, of another motion.
+    fn proposal_of_same_id(&self) -> Option<Proposal> {
+        let mut other = self.latched_proposals[0].clone()?;
+        other.action.pick = Isometry2::new(Vector2::new(0.5, 0.0), 0.0);
+        Some(other)
+    }
+
+    /// A client of the executor's action asks for a motion: its own, that of the planner's proposal, or a bad one.
+    fn send_goal_of_kind(&mut self, kind: usize) -> Check {
+        let mut goal = self.proposal_of_somebody();
+        match kind % 6 {
+            0 => goal.action.place = Isometry2::new(Vector2::new(7.0, 0.0), 0.0),
+            1 | 2 => goal = self.latched_proposals[0].clone().unwrap_or(goal),
+            3 if kind.is_multiple_of(4) => goal = self.proposal_of_same_id().unwrap_or(goal),
+            _ => goal.success_probability = Some(0.9).filter(|_| kind.is_multiple_of(2)),
+        }
+        self.send_goal(goal)
+    }
+
+    /// Somebody else's proposal: for this goal or another one, good or not.
+    fn foreign(&mut self, kind: usize) {
+        let template = self.proposal_of_somebody();
+        let step = template.step;
         let outside = Isometry2::new(Vector2::new(7.0, 0.0), 0.0);
         match kind % 6 {
             0 => self.publish_proposal(1, template),
@@ -968,14 +751,9 @@ impl World {
             }
             3 => self.publish(Message::Proposal(template.id, Err("cut off".into()))),
             4 => {
-                // The planner's id for another motion.
-                if let Some(own) = self.latched_proposals[0].clone() {
-                    let mut other = own;
-                    other.action.pick = template.action.pick;
-                    self.published
-                        .entry(other.id)
-                        .or_default()
-                        .push(other.clone());
+                if let Some(other) = self.proposal_of_same_id() {
+                    let of_id = self.published.entry(other.id).or_default();
+                    of_id.push(other.clone());
                     self.publish(Message::Proposal(other.id, Ok(other)));
                 }
             }
@@ -1018,36 +796,12 @@ impl World {
                 }
             }
             Action::Restart(number) => self.restart(party(number)),
-            Action::Deactivate => {
-                self.gate.deactivate();
-                self.approvals.clear();
-                self.home = None;
-                if self.motion.is_some() {
-                    self.cancelled = true;
-                    self.end_motion(StepOutcome::Stopped, 0.0)?;
-                }
-                // Subscriptions are made anew.
-                self.inbox(Party::Gate).clear();
-                self.send_latched(Party::Gate);
-            }
+            Action::Deactivate(way) => return self.deactivate(way),
             Action::Predict => return self.predict(),
             Action::Rehearse => return self.rehearse(),
-            Action::EndMotion(which) => {
-                let ends = [
-                    (StepOutcome::Placed, 1.0),
-                    (StepOutcome::Placed, 0.0),
-                    (StepOutcome::Placed, -1.0),
-                    (StepOutcome::GraspFailed, 0.0),
-                    (StepOutcome::NoContact, 0.0),
-                    (StepOutcome::Dropped, 0.0),
-                    (StepOutcome::LagAborted, 0.0),
-                    (StepOutcome::Fault, 0.0),
-                ];
-                let (outcome, delta_reward) = ends[which % ends.len()];
-                return self.end_motion(outcome, delta_reward);
-            }
+            Action::EndMotion(way) => return self.end_motion(way),
             Action::Observe(kind) => {
-                if self.motion.is_none() || kind % 2 == 0 {
+                if self.cell.motion.is_none() || kind % 2 == 0 {
                     match kind % 3 {
                         0 => {}
                         1 => self.seen.stamp += Duration::from_millis(100),
@@ -1061,10 +815,10 @@ impl World {
                 let count = self.published.len() + 1;
                 let id = self.published.keys().rev().nth(which % count).copied();
                 // Of a way home, as often as of another one.
-                let home = self.homes.iter().rev().nth(which / 2 % 2).copied();
+                let home = self.cell.homes.iter().rev().nth(which / 2 % 2).copied();
                 let id = home.filter(|_| which % 2 == 0).or(id);
                 let decision = OperatorDecision::ALL[decision % 6];
-                // At a terminal: who sits at a page hears of it.
+                // At a terminal: who sits at a page hears of it. Only who sits at the first one is an operator.
                 self.publish(Message::Confirmation(Confirmation {
                     stamp: self.now,
                     proposal_id: id.unwrap_or(unknown),
@@ -1079,41 +833,33 @@ impl World {
             }
             Action::Foreign(kind) => self.foreign(kind),
             Action::Tick => {
-                self.now += GRACE;
+                self.publish(Message::Presence(self.cell.somebody_is_there));
+                self.pass_time(GRACE)?;
                 for index in 0..2 {
                     if self.at_page[index] {
                         self.refresh(index);
                     }
                 }
-                return self.ask_gate();
             }
             Action::SetStep(step) => {
                 if let Ok(change) = self.tracker.set_step((step % GOALS) as u32 + 1) {
                     return self.after_tracker(change, None);
                 }
             }
-            Action::Obstacle(obstacle) => self.robot.ready = !obstacle,
-            Action::Home => {
-                let new = ProposalId(1_000_000 + self.homes.len() as u64);
-                let Ok(id) = self.gate.propose_home(new, Recovery::Home, &self.robot) else {
-                    return Ok(());
-                };
-                if self.motion.is_some() {
-                    return violation(format!("{id} is proposed while the arm moves"));
-                }
-                if id == new {
-                    self.homes.push(id);
-                    self.home = Some(id);
-                } else if self.home != Some(id) {
-                    return violation(format!("{id} is proposed again after it was withdrawn"));
-                }
-                if self.gate.moves_unasked(id) {
-                    let approve = OperatorDecision::Approve;
-                    let actions = self
-                        .gate
-                        .on_confirmation(id, approve, &self.robot, self.now);
-                    return self.act(actions);
-                }
+            Action::Obstacle(obstacle) => self.cell.robot.is_ready = !obstacle,
+            Action::Home(recovery) => return self.call_home(recovery),
+            Action::SendGoal(kind) => return self.send_goal_of_kind(kind),
+            Action::CancelGoal => return self.cancel_goal(),
+            Action::Presence(is_present) => {
+                self.cell.somebody_is_there = is_present;
+                self.publish(Message::Presence(is_present));
+            }
+            Action::Garble(which) => {
+                let count = self.published.len();
+                let mut ids = self.published.keys().rev();
+                let id = ids.nth(which % count.max(1)).copied();
+                let id = id.unwrap_or_default();
+                self.publish(Message::UnreadableConfirmation(id));
             }
         }
         Ok(())
@@ -1122,7 +868,9 @@ impl World {
     /// Messages get through at last, and motions succeed: the run has to end.
     fn must_end(&mut self) -> Check {
         self.fair = true;
-        self.robot.ready = true;
+        self.cell.robot.is_ready = true;
+        self.cell.somebody_is_there = true;
+        self.publish(Message::Presence(true));
         for party in PARTIES {
             self.send_latched(party);
         }
@@ -1138,8 +886,9 @@ impl World {
                     self.after_tracker(change, None)?;
                 }
             }
-            self.now += GRACE;
-            self.ask_gate()?;
+            self.publish(Message::Presence(true));
+            self.settle()?;
+            self.pass_time(GRACE)?;
             if self.clock_runs {
                 self.seen.stamp += Duration::from_millis(100);
             }
@@ -1162,17 +911,6 @@ impl World {
         ))
     }
 
-    /// The pending proposal, where it is to be rehearsed.
-    fn unrehearsed(&self) -> Option<ProposalId> {
-        let pending = self.gate.pending().map(|pending| pending.id);
-        pending.filter(|_| pending != self.robot.rehearsed)
-    }
-
-    fn rehearse(&mut self) -> Check {
-        self.robot.rehearsed = self.unrehearsed().or(self.robot.rehearsed);
-        self.ask_gate()
-    }
-
     /// Everything on its way arrives, the network answers, motions are rehearsed and end.
     fn settle(&mut self) -> Check {
         for _ in 0..10_000 {
@@ -1191,9 +929,9 @@ impl World {
                 quiet = false;
                 self.rehearse()?;
             }
-            if quiet && self.motion.is_some() {
+            if quiet && self.cell.motion.is_some() {
                 quiet = false;
-                self.end_motion(StepOutcome::Placed, 1.0)?;
+                self.end_motion(0)?;
             }
             if quiet {
                 return Ok(());
@@ -1214,6 +952,10 @@ fn schedule(seed: u64) -> Vec<Action> {
 struct Setting {
     clock_runs: bool,
     at_page: [bool; 2],
+    require_approval: RequireApproval,
+    require_presence: bool,
+    /// Whether only those decide who are named.
+    names_operators: bool,
 }
 
 impl Setting {
@@ -1225,6 +967,13 @@ impl Setting {
                 2 => [false, true],
                 _ => [true, true],
             },
+            require_approval: match seed / 8 % 5 {
+                0..3 => RequireApproval::Always,
+                3 => RequireApproval::Unsure { threshold: 0.8 },
+                _ => RequireApproval::Never,
+            },
+            require_presence: seed / 40 % 3 == 1,
+            names_operators: seed / 120 % 3 == 1,
         }
     }
 }

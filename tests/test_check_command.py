@@ -73,6 +73,7 @@ def check(
     """The exit code, and what each row says."""
     ros = [word for parameter in parameters for word in ("-p", f"camera_fusion:{parameter}")]
     ended = sctn(domain, "check", "--bag", bag, "--json", *arguments, "--", *ros)
+    assert ended.stdout, ended.stderr
     rows = json.loads(ended.stdout.splitlines()[-1])["measures"]
     return ended.returncode, {(row["name"], row["subject"]): row["good"] for row in rows}
 

@@ -244,8 +244,13 @@ def test_a_console_joins_a_graph_that_runs_and_another_one_after_it(start) -> No
         joined = start("sctn", "console", "--use-sim-time", "--port", 0)
         console = CLIENT.Console(address_of(joined, until), name)
         console.take_control()
-        proposed = console.wait("proposed")["proposal"]
-        until(lambda console=console: "approve" not in console.state()["refused"], "proposal that can be approved", 30.0)
+
+        def present(console: Any = console) -> dict[str, Any] | None:
+            """The proposal that can be approved: the one before it may come first."""
+            state = console.wait("proposed")
+            return state["proposal"] if "approve" not in state["refused"] else None
+
+        proposed = until(present, "proposal that can be approved", 30.0)
         console.decide("reject", proposed)
         until(lambda console=console, seen=proposed: console.wait("proposed")["proposal"]["id"] != seen["id"], "another proposal", 60.0)
         joined.end()

@@ -78,12 +78,13 @@ def browser() -> Iterator[Browser]:
 
 
 @pytest.fixture
-def decided(operator: Operator) -> Callable[[], list[StepConfirmation]]:
-    """What operators have decided, as the graph hears it, after a last look."""
+def decided(operator: Operator) -> Callable[..., list[StepConfirmation]]:
+    """What operators have decided, as the graph hears it, after a last look: `decided(2)` waits for two decisions at least."""
     heard: list[StepConfirmation] = []
     operator.node.create_subscription(StepConfirmation, "step_confirmation", heard.append, EVENT)
 
-    def look() -> list[StepConfirmation]:
+    def look(at_least: int = 0) -> list[StepConfirmation]:
+        operator.until(lambda: len(heard) >= at_least, f"{at_least} decisions on the graph", 30.0)
         operator.spin(0.3)
         return heard
 
@@ -225,7 +226,7 @@ def test_a_person_rejects_once_and_then_approves_a_run_of_stacking_to_its_end_by
     assert launch.wait(60.0) == 0, launch.log()
     assert "completed" in launch.output()
     # Each decision was heard on the graph, by name.
-    said = decided()
+    said = decided(1)
     assert said[0].decision == StepConfirmation.REJECT
     assert {one.operator_name for one in said} == {"Ada"}
     # And stands in the log and in the bag, with its time, beside the checkpoint of each proposal.
@@ -354,7 +355,7 @@ def test_a_motion_is_stopped_and_the_run_goes_on_and_a_second_browser_takes_over
     bob.can("Approve")
     bob.button("Approve").click()
     bob.reads("did it succeed")
-    said = decided()[approvals:]
+    said = decided(approvals + 1)[approvals:]
     assert [(one.proposal_id, one.decision, one.operator_name) for one in said] == [(corrected.id, StepConfirmation.APPROVE, "Bob")]
     # Confirmed, it is kept as something to learn from.
     bob.can("It succeeded")
@@ -404,7 +405,7 @@ def test_a_run_is_corrected_stopped_continued_and_handed_over_by_keyboard_alone(
     ada.reads("stopped")
     assert operator.next("step_result", results).outcome == StepResult.STOPPED
     slow_down(operator, 0.0)
-    said = [(one.proposal_id, one.decision) for one in decided()]
+    said = [(one.proposal_id, one.decision) for one in decided(2)]
     assert said[0] == (corrected.id, StepConfirmation.APPROVE)
     assert said[1][1] == StepConfirmation.STOP
     keyboard.press("h")
@@ -436,7 +437,7 @@ def test_a_run_is_corrected_stopped_continued_and_handed_over_by_keyboard_alone(
     bob.reaches(bob.button("Approve"))
     bob.page.keyboard.press("Enter")
     bob.reads("did it succeed")
-    assert [(one.operator_name, one.decision) for one in decided()[decisions:]] == [("Bob", StepConfirmation.APPROVE)]
+    assert [(one.operator_name, one.decision) for one in decided(decisions + 1)[decisions:]] == [("Bob", StepConfirmation.APPROVE)]
     ada.close()
     bob.close()
 
@@ -480,7 +481,7 @@ def test_what_was_proposed_before_the_table_changed_cannot_be_approved_and_the_p
     assert not is_greyed(ada)
     ada.button("Approve").click()
     ada.reads("did it succeed")
-    assert [(one.proposal_id, one.decision) for one in decided()] == [(renewed.id, StepConfirmation.APPROVE)]
+    assert [(one.proposal_id, one.decision) for one in decided(1)] == [(renewed.id, StepConfirmation.APPROVE)]
     ada.close()
 
 
@@ -849,8 +850,7 @@ def test_a_program_approves_a_step_and_is_refused_what_is_stale(start, decided) 
         console.decide("approve", second["proposal"])
     state = console.wait("awaiting_confirmation")
     assert state["steps"][-1]["proposal"]["id"] == second["proposal"]["id"]
-    until(lambda: len(decided()) >= 2, "decisions on the graph", 30.0)
-    said = [one.decision for one in decided()]
+    said = [one.decision for one in decided(2)]
     assert said == [StepConfirmation.REJECT, StepConfirmation.APPROVE]
     # The example, as a program of its own, takes over and goes on to the end.
     example = [sys.executable, REPOSITORY / "docs/examples/operator_console.py", address]
@@ -956,8 +956,7 @@ def test_hostile_input_moves_nothing_and_the_page_works_on(start, decided) -> No
     with concurrent.futures.ThreadPoolExecutor(8) as tabs:
         assert sum(tabs.map(approve, range(8))) == 1
     console.wait("awaiting_confirmation")
-    until(decided, "decision on the graph", 30.0)
-    assert [one.decision for one in decided()] == [StepConfirmation.APPROVE]
+    assert [one.decision for one in decided(1)] == [StepConfirmation.APPROVE]
 
 
 @pytest.mark.parametrize("model", LENSES)

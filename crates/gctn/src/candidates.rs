@@ -24,10 +24,30 @@ const RECOLORED: f64 = 0.5;
 /// otherwise.
 const MOST_TAKEN: f64 = 2.0;
 const MOST_TAKEN_OF_TURNS: f64 = 4.0;
-/// The same of turns by fine cells, which take nothing where the best turn differs by more than this: cables by 0.23 to 0.55, things
-/// that keep their shape by at most 0.17.
-const MOST_TAKEN_OF_FINE_TURNS: f64 = 8.0;
-const UNLIKE_FINE: f64 = 0.2;
+/// What fine cells may say of turns.
+struct SayOfTurns {
+    /// Factor of the shape weight.
+    weight: f64,
+    /// They take at most so much from a logit.
+    most_taken: f64,
+    /// They take nothing where the best turn differs by more than this.
+    unlike: f64,
+}
+
+/// Cables differ by 0.15 to 0.57, things that keep their shape by at most 0.17, and seen by cameras with noise by at most 0.24.
+const BESIDE_SURE_FEATURES: SayOfTurns = SayOfTurns {
+    weight: 1.0,
+    most_taken: 8.0,
+    unlike: 0.2,
+};
+const BESIDE_UNSURE_FEATURES: SayOfTurns = SayOfTurns {
+    weight: 2.0,
+    most_taken: 12.0,
+    unlike: 0.3,
+};
+/// The learned features are sure of a turn whose logit is so much above the mean over turns: of cables by 9 to 37, of things that keep
+/// their shape by 2 to 9, and seldom up to 11.
+const SURE_OF_TURN: f64 = 9.0;
 /// They take nothing from candidates where the best one differs by more than this: what is moved has no shape of its own, or hides.
 const UNLIKE: f64 = 0.1;
 /// A candidate stands on the lowest of what is so many cells around it, 62 mm.
@@ -408,19 +428,35 @@ impl<'a> Compared<'a> {
         cells.iter().map(point).collect()
     }
 
-    /// What the cells add to the logits of turns and places in the crop, against all other places: turns x places x places.
-    fn turns_added(&self, sample: i64, crop: &Crop, pick: Point2<f64>) -> Tensor {
+    /// What the cells add to the logits of turns and places in the crop, against all other places: turns x places x places. `learned`
+    /// are the logits there that they are added to; without them the features count as sure.
+    fn turns_added(
+        &self,
+        sample: i64,
+        crop: &Crop,
+        pick: Point2<f64>,
+        learned: Option<&Tensor>,
+    ) -> Tensor {
         let turns: Vec<usize> = (0..self.rotations).collect();
-        let (fineness, at_most) = match self.fine_shapes {
-            false => (Fineness::Grid, MOST_TAKEN_OF_TURNS),
-            true => (Fineness::Heightmap, MOST_TAKEN_OF_FINE_TURNS),
+        let fineness = match self.fine_shapes {
+            false => Fineness::Grid,
+            true => Fineness::Heightmap,
         };
         let shape = shape_difference(self, sample, crop, (&[pick], &turns), fineness);
-        let added = taken(&shape, self.shape_weight, at_most) + at_most;
-        match self.fine_shapes {
-            false => added,
-            true => added * shape.max().gt(-UNLIKE_FINE).to_kind(shape.kind()),
+        if !self.fine_shapes {
+            return taken(&shape, self.shape_weight, MOST_TAKEN_OF_TURNS) + MOST_TAKEN_OF_TURNS;
         }
+        let say = |say: SayOfTurns| {
+            let added = taken(&shape, say.weight * self.shape_weight, say.most_taken);
+            (added + say.most_taken) * shape.max().gt(-say.unlike).to_kind(shape.kind())
+        };
+        let beside_sure = say(BESIDE_SURE_FEATURES);
+        let Some(learned) = learned else {
+            return beside_sure;
+        };
+        let tops = learned.amax([1, 2].as_slice(), false);
+        let is_sure = (tops.max() - tops.mean(None::<Kind>)).ge(SURE_OF_TURN);
+        beside_sure.where_self(&is_sure, &say(BESIDE_UNSURE_FEATURES))
     }
 
     /// Turns that candidates are compared at.
@@ -472,15 +508,16 @@ pub(crate) fn add_shape(
     let Some(model) = model else { return };
     let pick = pick_px.map(|coordinate_px| grid.index(coordinate_px));
     let crop = Crop::new(grid, model.place());
-    let added = model.turns_added(0, &crop, pick);
     // Places count from the margin's corner. Those beyond the last row or column are none.
     let places = Crop::places(grid, crop.edge);
     let rows = places.min(grid.rows as i64 - crop.row);
     let cols = places.min(grid.cols as i64 - crop.col);
-    let _ = logits
-        .narrow(2, crop.row, rows)
-        .narrow(3, crop.col, cols)
-        .g_add_(&added.narrow(1, 0, rows).narrow(2, 0, cols).unsqueeze(0));
+    let mut logits = logits
+        .squeeze_dim(0)
+        .narrow(1, crop.row, rows)
+        .narrow(2, crop.col, cols);
+    let added = model.turns_added(0, &crop, pick, Some(&logits));
+    let _ = logits.g_add_(&added.narrow(1, 0, rows).narrow(2, 0, cols));
 }
 
 /// What [`add_shape`] adds to the turns of the true picks at the true places: N x rotations, `None` where it adds nothing. Not learned.
@@ -498,7 +535,7 @@ pub(crate) fn turn_shapes(
             let pick = label.pick_px.map(|coordinate_px| grid.index(coordinate_px));
             let place = cell_of(grid, label.place_px);
             let crop = Crop::new(grid, place);
-            let added = model.turns_added(sample as i64, &crop, pick);
+            let added = model.turns_added(sample as i64, &crop, pick, None);
             // The object may have been held a cell beside the point that was labelled.
             let within = |at: usize, begin: i64| {
                 (at as i64 - begin - 1).clamp(0, Crop::places(grid, crop.edge) - 3)

@@ -7,7 +7,7 @@ use tch::{Kind, Tensor};
 
 use crate::augment::Warp;
 use crate::candidates::{add_fits, add_shape};
-use crate::input::{check_goal, check_heightmap, encode, rotation_angle, tensor, to_world};
+use crate::input::{check_goal, check_heightmap, encode, tensor, to_world};
 use crate::losses::place_logits;
 use crate::network::{Builder, Features, Model};
 use crate::{
@@ -120,10 +120,9 @@ impl Policy {
             let grid = &self.model.grid;
             let logits = place_logits(grid, &features, &[pick_px], &turns, config.rotations);
             add_shape(grid, &features, config, pick_px, &logits);
-            let (place_px, rotation, place_score, place_map) =
-                self.place(&logits.squeeze_dim(0))?;
+            let (place_px, turn, place_score, place_map) = self.place(&logits.squeeze_dim(0))?;
 
-            let mut yaw_rad = rotation_angle(rotation, config.rotations);
+            let mut yaw_rad = std::f64::consts::TAU * turn / config.rotations as f64;
             if yaw_rad > std::f64::consts::PI {
                 yaw_rad -= std::f64::consts::TAU;
             }
@@ -226,10 +225,16 @@ impl Policy {
         Ok((center_px(best), sum.recip(), self.map(scores)))
     }
 
-    fn place(&self, logits: &Tensor) -> Result<(Point2<f64>, usize, f64, ScoreMap), Error> {
-        let grid = &self.model.grid;
+    /// Where to place, by which turn (in rotations of the network), the score of that and the scores at the nearest rotation.
+    fn place(&self, logits: &Tensor) -> Result<(Point2<f64>, f64, f64, ScoreMap), Error> {
+        let (grid, config) = (&self.model.grid, &self.model.config);
+        // Turns by fine cells are known to a few degrees, less than from one rotation to the next.
+        let turns: &[i64] = match config.has_fine_shapes() {
+            true => &[0, -1, 1],
+            false => &[0],
+        };
         let cells = grid.rows * grid.cols;
-        // Found where the maps were computed: of all turns only one map is copied, and there is one wait for it.
+        // Found where the maps were computed: of all turns only one map is copied, or that and its neighbours, and there is one wait.
         let logits = logits.reshape([-1, cells as i64]);
         let best = logits.argmax(None, false);
         let rotation = best.divide_scalar_mode(cells as i64, "floor");
@@ -239,13 +244,15 @@ impl Policy {
             .exp()
             .sum(Kind::Double);
         let found = [best, low, top, sum].map(|number| number.to_kind(Kind::Double).view([1]));
-        let map = logits.index_select(0, &rotation.view([1])).view([-1]);
+        let turns = Tensor::from_slice(turns).to_device(logits.device());
+        let turns = (rotation.view([1]) + turns).remainder(config.rotations as i64);
+        let maps = logits.index_select(0, &turns).view([-1]);
         let [best, low, top, sum] = &found;
-        let read = Tensor::cat(&[best, low, top, sum, &map.to_kind(Kind::Double)], 0);
+        let read = Tensor::cat(&[best, low, top, sum, &maps.to_kind(Kind::Double)], 0);
         let mut numbers = vec![0.0f64; read.numel()];
         read.to_device(tch::Device::Cpu)
             .f_copy_data(&mut numbers, read.numel())?;
-        let ([best, low, top, sum], map) = match numbers.split_first_chunk() {
+        let ([best, low, top, sum], maps) = match numbers.split_first_chunk() {
             Some((found, map)) => (*found, map),
             None => ([f64::NAN; 4], &[][..]),
         };
@@ -253,12 +260,13 @@ impl Policy {
             let what = "the place map";
             return Err(Error::NotFinite { what, step: None });
         }
-        let map: Vec<f32> = map.iter().map(|logit| *logit as f32).collect();
+        let maps: Vec<f32> = maps.iter().map(|logit| *logit as f32).collect();
+        let (map, beside) = maps.split_at(cells);
         let log_sum = top + sum.ln();
         let (rotation, cell) = (best as usize / cells, best as usize % cells);
         let (row, col) = (cell / grid.cols, cell % grid.cols);
         let offset = if grid.subcell {
-            subcell(&map, grid.rows, grid.cols, row, col)
+            subcell(map, grid.rows, grid.cols, row, col)
         } else {
             [0.0; 2]
         };
@@ -268,7 +276,23 @@ impl Policy {
         );
         let score = |logit: f32| (f64::from(logit) - log_sum).exp().min(1.0);
         let scores = map.iter().map(|logit| score(*logit) as f32).collect();
-        Ok((place_px, rotation, score(map[cell]), self.map(scores)))
+        // An object that is turned by a little more or less may fit best a cell beside.
+        let top = |map: &[f32]| {
+            let near = |at: usize, len: usize| at.saturating_sub(1)..(at + 2).min(len);
+            let rows = near(row, grid.rows);
+            let cells = rows.flat_map(|row| near(col, grid.cols).map(move |col| (row, col)));
+            let logits = cells.map(|(row, col)| map[row * grid.cols + col]);
+            logits.fold(f32::NEG_INFINITY, f32::max)
+        };
+        let between = match beside.is_empty() {
+            true => 0.0,
+            false => {
+                let (before, after) = beside.split_at(cells);
+                vertex([top(before), map[cell], top(after)])
+            }
+        };
+        let turn = rotation as f64 + between;
+        Ok((place_px, turn, score(map[cell]), self.map(scores)))
     }
 }
 
@@ -323,16 +347,21 @@ fn subcell(map: &[f32], rows: usize, cols: usize, row: usize, col: usize) -> [f6
         if index == 0 || index + 1 == len {
             return 0.0;
         }
-        let [before, here, after] = [at(index - 1), at(index), at(index + 1)].map(f64::from);
-        let curvature = before - 2.0 * here + after;
-        if curvature < 0.0 {
-            (0.5 * (before - after) / curvature).clamp(-0.5, 0.5)
-        } else {
-            0.0
-        }
+        vertex([at(index - 1), at(index), at(index + 1)])
     };
     [
         offset(col, cols, &|col| map[row * cols + col]),
         offset(row, rows, &|row| map[row * cols + col]),
     ]
+}
+
+/// Where the parabola through values at -1, 0 and 1 has its maximum, at most half a step from 0.
+fn vertex(values: [f32; 3]) -> f64 {
+    let [before, here, after] = values.map(f64::from);
+    let curvature = before - 2.0 * here + after;
+    if curvature < 0.0 {
+        (0.5 * (before - after) / curvature).clamp(-0.5, 0.5)
+    } else {
+        0.0
+    }
 }

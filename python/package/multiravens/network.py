@@ -63,8 +63,9 @@ _AROUND_CELLS = 10
 # The cells themselves take at most so much from the logit of a candidate, and of a turn. They take nothing from candidates where the
 # best one differs by more than this. Heights count down to this below what is compared, and up to this above it (of 40 mm).
 _MOST_TAKEN, _MOST_TAKEN_OF_TURNS, _UNLIKE, _DEEPEST = 2.0, 4.0, 0.1, 0.5
-# The same of turns by the cells of the heightmap, which take nothing where the best turn differs by more than this.
-_MOST_TAKEN_OF_FINE_TURNS, _UNLIKE_FINE = 8.0, 0.2
+# The same of turns by the cells of the heightmap, which take nothing where the best turn differs by more than this, and the factor of
+# their weight: where the learned features are sure of the turn, whose logit is then so much above the mean over turns, and where not.
+_BESIDE_SURE, _BESIDE_UNSURE, _SURE_OF_TURN = (8.0, 0.2, 1.0), (12.0, 0.3, 2.0), 9.0
 # What appeared has risen by more than this (of 40 mm), or its colour has changed by more than that (of 128, over three channels).
 _RISEN, _RECOLORED = 0.1, 0.5
 
@@ -369,16 +370,20 @@ class Network(nn.Module):
         assert features.place is not None
         rows, cols = self.grid
         fine = self.config["network"]["fine_shapes"]
-        most = _MOST_TAKEN_OF_FINE_TURNS if fine else _MOST_TAKEN_OF_TURNS
+        most, unlike, factor = _MOST_TAKEN_OF_TURNS, math.inf, 1.0
         shape = self._shape_difference(features, [center], 1, fine)[0]
-        # A cable has another shape wherever it lies.
-        if fine and shape.max() <= -_UNLIKE_FINE:
-            return logits
-        shape = (self.config["network"]["shape_weight"] * (shape - shape.max())).clamp_min(-most)
-        added = torch.full_like(logits, -most)
         top, left, _ = self._crop(features.place)
         high, wide = min(shape.shape[1], rows - top), min(shape.shape[2], cols - left)
-        added[:, top : top + high, left : left + wide] = shape[:, :high, :wide]
+        within = (slice(None), slice(top, top + high), slice(left, left + wide))
+        if fine:
+            tops = logits[within].amax((1, 2))
+            most, unlike, factor = _BESIDE_SURE if tops.max() - tops.mean() >= _SURE_OF_TURN else _BESIDE_UNSURE
+        # A cable has another shape wherever it lies.
+        if shape.max() <= -unlike:
+            return logits
+        shape = (factor * self.config["network"]["shape_weight"] * (shape - shape.max())).clamp_min(-most)
+        added = torch.full_like(logits, -most)
+        added[within] = shape[:, :high, :wide]
         return logits + added
 
     def _taken(self, features: Features, peaks: Sequence[tuple[int, int]]) -> torch.Tensor:
@@ -669,7 +674,8 @@ class Policy:
         place_map = np.minimum(np.exp(places[turn] - log_sum), 1.0).astype(np.float32)
         offset = [0.0, 0.0] if stride == 1 else [_between(places[turn, to_row], to_col), _between(places[turn, :, to_col], to_row)]
         place_px = [(to_col + offset[0] + 0.5) * stride, (to_row + offset[1] + 0.5) * stride]
-        yaw = 2 * math.pi * turn / config["rotations"]
+        between = _between_turns(places, (turn, to_row, to_col)) if config["network"].get("fine_shapes") else 0.0
+        yaw = 2 * math.pi * (turn + between) / config["rotations"]
         yaw = yaw - 2 * math.pi if yaw > math.pi else yaw
 
         done = None if features.done is None else float(torch.sigmoid(features.done))
@@ -703,6 +709,18 @@ def _between(logits: Any, index: int) -> float:
     """Where between cells the maximum lies: labels are Gaussians, so logarithms of probabilities are parabolas."""
     if index == 0 or index + 1 == len(logits):
         return 0.0
-    before, here, after = (float(logits[index + step]) for step in (-1, 0, 1))
+    return _vertex(*(float(logits[index + step]) for step in (-1, 0, 1)))
+
+
+def _between_turns(logits: Any, best: tuple[int, int, int]) -> float:
+    """The same between rotations: an object that is turned by a little more or less may fit best a cell beside."""
+    turn, row, col = best
+    near = (slice(max(row - 1, 0), row + 2), slice(max(col - 1, 0), col + 2))
+    before, after = (float(logits[(turn + step) % len(logits)][near].max()) for step in (-1, 1))
+    return _vertex(before, float(logits[best]), after)
+
+
+def _vertex(before: float, here: float, after: float) -> float:
+    """Where the parabola through values at -1, 0 and 1 has its maximum, at most half a step from 0."""
     curvature = before - 2 * here + after
     return float(np.clip(0.5 * (before - after) / curvature, -0.5, 0.5)) if curvature < 0 else 0.0

@@ -807,31 +807,47 @@ mod tests {
             .expand([1, 4, -1, -1], false)
     }
 
-    #[test]
-    fn a_small_square_shows_its_turn_by_the_cells_of_the_heightmap() {
+    /// Logits of places where a small square at 10, 10 was shown at 45, 22 as `shown` has it, and the learned features prefer the turn of
+    /// index 5 by `learned`.
+    fn logits_of_a_square(shown: &Tensor, learned: f64) -> Tensor {
         let pick_px = Point2::new(GRID.coordinate_px(10.0), GRID.coordinate_px(10.0));
         let seen = turned_square(8.3, (10.0, 10.0), 0);
-        let added = |shown: &Tensor| {
-            let mut features = features(&[(10, 10, 3)], (45, 22, 3));
-            let fit = features.first.as_mut().and_then(|first| first.fit.as_mut());
-            fit.unwrap().cells = [&seen, &seen.zeros_like(), shown].map(Tensor::shallow_clone);
-            let logits = Tensor::zeros([1, 36, 60, 40], (Kind::Float, tch::Device::Cpu));
-            let mut config = config(4, [80.0, 0.0]);
-            if let Network::Matching(matching) = &mut config.network {
-                matching.fine_shapes = true;
-            }
-            add_shape(&GRID, &features, &config, pick_px, &logits);
-            logits
-        };
+        let mut features = features(&[(10, 10, 3)], (45, 22, 3));
+        let fit = features.first.as_mut().and_then(|first| first.fit.as_mut());
+        fit.unwrap().cells = [&seen, &seen.zeros_like(), shown].map(Tensor::shallow_clone);
+        let logits = Tensor::zeros([1, 36, 60, 40], (Kind::Float, tch::Device::Cpu));
+        let _ = logits.narrow(1, 5, 1).fill_(learned);
+        let mut config = config(4, [80.0, 0.0]);
+        if let Network::Matching(matching) = &mut config.network {
+            matching.fine_shapes = true;
+        }
+        add_shape(&GRID, &features, &config, pick_px, &logits);
+        logits
+    }
+
+    /// Turn, of a square that looks alike after nine, row and column of the highest logit.
+    fn best_of(logits: &Tensor) -> (usize, usize, usize) {
+        let best = logits.argmax(None, false).int64_value(&[]) as usize;
+        (best / 2400 % 9, best / 40 % 60, best % 40)
+    }
+
+    #[test]
+    fn a_small_square_shows_its_turn_by_the_cells_of_the_heightmap() {
         for turn in [0, 2, 4, 7] {
-            let logits = added(&turned_square(8.3, (45.0, 22.0), turn));
-            let best = logits.argmax(None, false).int64_value(&[]) as usize;
-            let at = (best / 2400 % 9, best / 40 % 60, best % 40);
-            assert_eq!(at, (turn, 45, 22));
+            let logits = logits_of_a_square(&turned_square(8.3, (45.0, 22.0), turn), 0.0);
+            assert_eq!(best_of(&logits), (turn, 45, 22));
         }
         // What keeps no shape says nothing.
         let other = turned_square(20.0, (45.0, 22.0), 0);
-        assert_eq!(added(&other).abs().max().double_value(&[]), 0.0);
+        let logits = logits_of_a_square(&other, 0.0);
+        assert_eq!(logits.abs().max().double_value(&[]), 0.0);
+    }
+
+    #[test]
+    fn cells_turn_what_the_features_are_unsure_of_and_leave_what_they_are_sure_of() {
+        let shown = turned_square(8.3, (45.0, 22.0), 1);
+        assert_eq!(best_of(&logits_of_a_square(&shown, 9.0)), (1, 45, 22));
+        assert_eq!(best_of(&logits_of_a_square(&shown, 9.5)).0, 5);
     }
 
     #[test]

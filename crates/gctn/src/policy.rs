@@ -188,7 +188,8 @@ impl Policy {
         exclude: &[Disk],
     ) -> Result<(Point2<f64>, f64, ScoreMap), Error> {
         let (grid, config) = (&self.model.grid, &self.model.config);
-        let mut logits = values(&features.pick, "the pick map")?;
+        let learned = values(&features.pick, "the pick map")?;
+        let mut logits = learned.clone();
         let center_px = |index: usize| {
             let (row, col) = (index / grid.cols, index % grid.cols);
             Point2::new(
@@ -196,11 +197,13 @@ impl Policy {
                 grid.coordinate_px(row as f64),
             )
         };
-        for disk in exclude {
+        let is_within = |disk: &Disk, point_px: &Point2<f64>| {
             let disk_px = workspace.point_px(&disk.center_m);
-            let radius_px = disk.radius_m / config.pixel_size_m;
+            (disk_px - point_px).norm() <= disk.radius_m / config.pixel_size_m
+        };
+        for disk in exclude {
             for (index, logit) in logits.iter_mut().enumerate() {
-                if (disk_px - center_px(index)).norm() <= radius_px {
+                if is_within(disk, &center_px(index)) {
                     *logit = f32::NEG_INFINITY;
                 }
             }
@@ -222,7 +225,19 @@ impl Policy {
             .collect();
         let sum: f64 = shares.iter().sum();
         let scores = shares.iter().map(|share| (share / sum) as f32).collect();
-        Ok((center_px(best), sum.recip(), self.map(scores)))
+        // Of the other networks picks are in the middle of a cell: that is how their checkpoints were measured.
+        let between = features.first.as_ref().map(|_| {
+            let (row, col) = (best / grid.cols, best % grid.cols);
+            let [right, down] = subcell(&learned, grid.rows, grid.cols, row, col);
+            Point2::new(
+                grid.coordinate_px(col as f64 + right),
+                grid.coordinate_px(row as f64 + down),
+            )
+        });
+        let between =
+            between.filter(|pick_px| !exclude.iter().any(|disk| is_within(disk, pick_px)));
+        let pick_px = between.unwrap_or_else(|| center_px(best));
+        Ok((pick_px, sum.recip(), self.map(scores)))
     }
 
     /// Where to place, by which turn (in rotations of the network), the score of that and the scores at the nearest rotation.

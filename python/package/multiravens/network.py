@@ -655,9 +655,11 @@ class Policy:
         x_px, y_px = (x + 0.5) * stride, (y + 0.5) * stride
         pixel = config["pixel_size_m"]
 
-        picks = features.pick.double().numpy().copy()
-        for point in exclude:
-            away = np.hypot(x_px - (point[0] - 0.25) / pixel, y_px - (point[1] + 0.5) / pixel)
+        learned = features.pick.double().numpy()
+        picks = learned.copy()
+        excluded_px = [((point[0] - 0.25) / pixel, (point[1] + 0.5) / pixel) for point in exclude]
+        for point_px in excluded_px:
+            away = np.hypot(x_px - point_px[0], y_px - point_px[1])
             picks[away <= radius_m / pixel] = -np.inf
         if not np.isfinite(picks.max()):
             raise ValueError("exclude: leaves nothing to pick, expected fewer or a smaller radius_m")
@@ -665,6 +667,14 @@ class Policy:
             picks = net.add_fits(features, picks)
         row, col = divmod(int(picks.argmax()), cols)
         pick_px = [float(x_px[row, col]), float(y_px[row, col])]
+        if features.place is not None:
+            # Of the other networks picks are in the middle of a cell: that is how their checkpoints were measured.
+            between_px = [
+                pick_px[0] + stride * _between(learned[row], col),
+                pick_px[1] + stride * _between(learned[:, col], row),
+            ]
+            if not any(math.dist(between_px, point_px) <= radius_m / pixel for point_px in excluded_px):
+                pick_px = between_px
         pick_map = np.exp(picks - picks.max())
         pick_map = (pick_map / pick_map.sum()).astype(np.float32)
 

@@ -455,10 +455,15 @@ impl Operator {
             let since = *asked.since.get_or_insert(now);
             now.saturating_sub(since) > ANSWERED_WITHIN
         };
-        let index = self.unanswered.iter_mut().position(is_late)?;
-        let asked = self.unanswered.remove(index);
-        self.reopen(asked);
-        Some((asked.id, asked.decision))
+        loop {
+            let index = self.unanswered.iter_mut().position(is_late)?;
+            let asked = self.unanswered.remove(index);
+            self.reopen(asked);
+            // What stays closed is not to be decided again: see `probe`.
+            if asked.before != Some(Standing::Closed) {
+                return Some((asked.id, asked.decision));
+            }
+        }
     }
 
     /// Another goal has come: it answers what was decided on a step. What was approved for the goal before may come to nothing; the
@@ -553,12 +558,16 @@ impl Operator {
             );
         let still_moves =
             outcome == StepOutcome::Refused && result.status == Some(ProposalStatus::Moving);
-        self.unanswered.retain(|asked| {
+        self.unanswered.retain_mut(|asked| {
             let is_answered = match asked.decision {
                 OperatorDecision::Approve => !still_moves,
                 OperatorDecision::Reject => !goal_follows,
                 _ => false,
             };
+            if asked.id == id && asked.decision == OperatorDecision::Reject {
+                // It can never be approved again, whether a goal follows or the goal tracker has gone on to another proposal.
+                asked.before = Some(Standing::Closed);
+            }
             asked.id != id || !is_answered
         });
         let before = self.known(id).map(|known| known.standing);

@@ -430,6 +430,37 @@ fn a_page_shows_the_proposal_of_the_goal_whatever_else_is_proposed() {
 }
 
 #[test]
+fn a_rejection_that_was_taken_and_brings_no_goal_is_not_asked_for_again_and_what_else_was_proposed_is_probed()
+ {
+    let mut operator = at_page();
+    // The goal tracker has gone on to the other one, whose end this page has heard.
+    operator.on_proposal(proposal(8, 10));
+    operator.on_result(StepResult {
+        status: Some(ProposalStatus::Withdrawn),
+        ..result(8, StepOutcome::Stopped)
+    });
+    operator.on_continued();
+    operator.decide(&says(OperatorDecision::Reject, 7), NOW);
+    operator.on_result(StepResult {
+        status: Some(ProposalStatus::Rejected),
+        ..result(7, StepOutcome::Refused)
+    });
+    assert_eq!(operator.ask_again(LATE), None);
+    assert_eq!(operator.phase(), RunPhase::AwaitingProposal);
+    let probed = |now| {
+        assert_eq!(operator.probe(now), None);
+        let id = operator.probe(now + LATE)?;
+        operator.on_result(StepResult {
+            status: Some(ProposalStatus::Withdrawn),
+            ..result(id.0, StepOutcome::Refused)
+        });
+        Some(id.0)
+    };
+    let probed: Vec<_> = [LATE, LATE * 3].into_iter().map(probed).collect();
+    assert_eq!(probed, [Some(8), Some(7)]);
+}
+
+#[test]
 fn the_executors_word_on_a_proposal_is_where_it_stands() {
     for (status, phase) in [
         (Some(ProposalStatus::Pending), RunPhase::Proposed),

@@ -135,7 +135,7 @@ def run_cells(faults: list[Planned], seed: int, until_s: float = float("inf")) -
         waiting, went_on = len(left), ""
         try:
             # With it every approval away from home is refused for that reason, which would hide others: so it is in every second cell.
-            needs_home = left[0].number % 2 == 1
+            needs_home = left[0].number % 2 == 1 or layout is Layout.WHOLE_GRAPH
             with working_cell(layout, seed=left[0].number, needs_home=needs_home) as bench:
                 went_on = begin(bench)
                 for _ in range(FAULTS_OF_A_CELL):

@@ -52,6 +52,12 @@ FREE_PLACES = [(x_m, y_m) for y_m in (-0.33, 0.33) for x_m in (0.38, 0.48, 0.58,
 DISK_RADIUS_M, DISK_HEIGHT_M = 0.028, 0.012
 # The goals of the oracle.
 DEMONSTRATION = REPOSITORY / "bags/sample/placing"
+# What the whole graph has beside driver, watchdog, executor and oracle, and whether it hears confirmations.
+GRAPH = {"camera_fusion": False, "gctn_policy": True, "operator_console": True}
+# Images come so often in the whole graph [s]: enough for the faults, and the processors are not busy with them.
+FRAMES_PERIOD_S = 0.1
+# The policy has proposed by then what the executor can plan, also where the oracle was just started again.
+PROPOSED_S = 60.0
 # A step that was confirmed is counted by then.
 COUNTED_S = 15.0
 # The driver's actions. The second one answers a goal after 1 to 2 s.
@@ -98,6 +104,8 @@ class Layout(enum.Enum):
     TWO_HOSTS = "two hosts"
     # The executor's time is that of /clock.
     CLOCK = "clock"
+    # Cameras, fusion, policy, oracle and page run too: the policy proposes.
+    WHOLE_GRAPH = "whole graph"
 
 
 @dataclasses.dataclass
@@ -117,6 +125,8 @@ class Bench:
     needs_home: bool = False
     # Once a step is to be counted.
     oracle: Process | None = None
+    # The others of the whole graph, by name.
+    graph: dict[str, Process] = dataclasses.field(default_factory=dict)
     # To the executor's host, where that is another.
     link: lossy_link.Link | None = None
     # The newest proposal, which moves the arm when a fault comes.
@@ -217,7 +227,10 @@ class Bench:
 
     def start_driver(self) -> None:
         """Starts the simulated cell, with an arm at home."""
-        self.driver = self.start("sim_workcell", *arguments("sim_workcell", seed=10000))
+        values: dict[str, object] = {"seed": 10000}
+        if self.layout is Layout.WHOLE_GRAPH:
+            values["frames_period_s"] = FRAMES_PERIOD_S
+        self.driver = self.start("sim_workcell", *arguments("sim_workcell", **values))
 
     def start_watchdog(self) -> None:
         """Starts the watchdog."""
@@ -243,6 +256,16 @@ class Bench:
         self.operator.next("goal", after, timeout_s=60.0)
         # It hears confirmations too.
         self.operator.listeners += 1
+
+    def start_in_graph(self, name: str) -> None:
+        """Starts a node of the whole graph, on the driver's host."""
+        values: dict[str, dict[str, object]] = {
+            "camera_fusion": {},
+            "gctn_policy": {"checkpoint": REPOSITORY / "config/checkpoints/ten_problems.safetensors"},
+            "operator_console": {"port": 0, "library": self.logs / "library", "training": self.logs / "training"},
+        }
+        self.graph[name] = self.start(name, *arguments(name, **values[name]))
+        self.operator.listeners += GRAPH[name]
 
     def confirmation_readers(self) -> set[bytes]:
         """The endpoints that hear confirmations."""
@@ -397,6 +420,10 @@ def working_cell(layout: Layout = Layout.ONE_HOST, planted: str | None = None, s
         operator.until(lambda: "motion_watchdog" in operator.node.get_node_names(), "watchdog", 30.0)
         # The executor, and the monitor.
         operator.listeners = 2
+        if layout is Layout.WHOLE_GRAPH:
+            bench.start_oracle()
+            for name in GRAPH:
+                bench.start_in_graph(name)
         operator.spin(0.5)
         yield bench
 
@@ -424,7 +451,8 @@ def begin(bench: Bench, make: Callable[[Bench], PickPlace] | None = None) -> str
 
 def begin_from_home(bench: Bench) -> str:
     """The same; where the arm cannot begin from where it stands it goes home first."""
-    went_on = begin(bench)
+    # The policy proposes what the cameras have seen while the arm was at home.
+    went_on = "the cameras see the arm" if bench.layout is Layout.WHOLE_GRAPH else begin(bench)
     if went_on == "moves":
         return went_on
     # From where a fault has left it the arm may not get to the pick, or may be in view.
@@ -451,6 +479,11 @@ def recover(bench: Bench) -> None:
     for name, usual in list(bench.changed.items()):
         bench.set_hardware(name, usual, usual)
     bench.fault = "none"
+    if bench.oracle and bench.oracle.exit_code is not None:
+        bench.start_oracle()
+    for name, node in list(bench.graph.items()):
+        if node.exit_code is not None:
+            bench.start_in_graph(name)
     if bench.executor.exit_code is not None:
         before = bench.confirmation_readers()
         bench.executor = bench.start_executor()
@@ -468,10 +501,15 @@ def propose_home(bench: Bench, service: str = "propose_home") -> ProposeHome.Res
 def go_home(bench: Bench) -> str:
     """Brings the arm home by an approved proposal; why it did not get there, if it did not."""
     for _ in range(ATTEMPTS):
-        reason = get_home(bench, propose_home(bench))
+        reason = get_home(bench, propose_home(bench, way_home(bench)))
         if not is_unheard(bench, reason):
             break
     return reason
+
+
+def way_home(bench: Bench) -> str:
+    """The service that proposes it: the policy proposes another part, so that what is held is put down first."""
+    return "propose_put_down" if bench.vacuum and bench.layout is Layout.WHOLE_GRAPH else "propose_home"
 
 
 def get_home(bench: Bench, proposed: ProposeHome.Response) -> str:
@@ -524,6 +562,8 @@ def propose(bench: Bench, change: Callable[[PickPlace], None] = lambda _: None, 
     The table is there: black at height 0 is what no camera has seen.
     """
     operator = bench.operator
+    if bench.layout is Layout.WHOLE_GRAPH:
+        return proposal_of_policy(bench)
 
     def look(heightmap: Heightmap) -> None:
         heightmap.rgb = np.full(len(heightmap.rgb), 90, dtype=np.uint8)
@@ -539,6 +579,17 @@ def propose(bench: Bench, change: Callable[[PickPlace], None] = lambda _: None, 
     # An executor that was killed acknowledges nothing: the present one says what it makes of the proposal.
     operator.until(lambda: bench.planned_id == proposal.id, "planned motion", 30.0)
     return proposal
+
+
+def proposal_of_policy(bench: Bench) -> PickPlace:
+    """What the policy proposes for the oracle's first goal, once the executor has planned it."""
+    goal = first_goal(bench)
+
+    def proposal() -> PickPlace | None:
+        made = [made for made in bench.operator.received["pick_place"][-1:] if (made.step, made.attempt) == (goal.step, goal.attempt)]
+        return made[0] if made and made[0].id == bench.planned_id else None
+
+    return bench.operator.until(proposal, "planned proposal of the policy", PROPOSED_S)
 
 
 def begin_with_disk(bench: Bench) -> None:

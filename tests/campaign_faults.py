@@ -10,6 +10,7 @@ from collections.abc import Callable
 from campaign_cell import (
     ATTEMPTS,
     CONTROLLER,
+    GRAPH,
     UNDECIDED_S,
     Bench,
     Layout,
@@ -118,6 +119,25 @@ def freeze_watchdog(bench: Bench) -> None:
     stop(bench)
     bench.operator.spin(FROZEN_S)
     bench.watchdog.signal(signal.SIGCONT)
+
+
+def gone(name: str, number: signal.Signals) -> Fault:
+    """A node that neither moves the arm nor stops it is killed, or stands still for a while: the arm goes on, and can be stopped."""
+
+    def inject(bench: Bench) -> None:
+        process = bench.oracle if name == "goal_oracle" else bench.graph[name]
+        process.signal(number)
+        if number is signal.SIGKILL:
+            process.wait(EXIT_S)
+            bench.operator.listeners -= GRAPH.get(name, True)
+        bench.operator.spin(0.3)
+        stop(bench)
+        if number is signal.SIGSTOP:
+            bench.operator.spin(FROZEN_S)
+            process.signal(signal.SIGCONT)
+
+    inject.__name__ = f"{'kill' if number is signal.SIGKILL else 'freeze'}_{name}_in_graph"
+    return inject
 
 
 def robot(fault: str) -> Fault:
@@ -416,6 +436,9 @@ def whole_step_with_loss(bench: Bench) -> None:
     bench.operator.confirm(bench.proposal.id, StepConfirmation.STOP)
 
 
+# Of the whole graph.
+GONE = [gone(name, number) for name in ("goal_oracle", *GRAPH) for number in (signal.SIGKILL, signal.SIGSTOP)]
+
 FAULTS = [
     stop,
     stop_naming_no_proposal,
@@ -455,6 +478,7 @@ FAULTS = [
     kill_executor_after_step,
     freeze_oracle,
     step_with_loss,
+    *GONE,
 ]
 
 # Faults that need another cell than the usual one.
@@ -464,4 +488,5 @@ LAYOUTS = {
     stop_with_loss: Layout.TWO_HOSTS,
     whole_step_with_loss: Layout.TWO_HOSTS,
     step_with_loss: Layout.TWO_HOSTS,
+    **dict.fromkeys(GONE, Layout.WHOLE_GRAPH),
 }

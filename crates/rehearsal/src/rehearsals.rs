@@ -95,8 +95,15 @@ impl<C> Rehearsals<C> {
     ) {
         self.seen = Some((Arc::clone(heightmap), stamp));
         self.had_publisher |= publishers > 0;
-        if !at_home.may_be_in_view(stamp) {
-            self.without_arm = Some(Arc::clone(heightmap));
+        if at_home.may_be_in_view(stamp) {
+            return;
+        }
+        self.without_arm = Some(Arc::clone(heightmap));
+        // It was on its way when the motion began: the arm has not left home yet, and nothing is picked.
+        if let Some(picked) = &mut self.picked
+            && picked.at_home == *at_home
+        {
+            picked.seen = Arc::clone(heightmap);
         }
     }
 
@@ -125,12 +132,13 @@ impl<C> Rehearsals<C> {
         }
     }
 
-    /// A motion begins.
-    pub fn on_motion(&mut self, order: &MotionOrder) {
+    /// A motion begins. `at_home`: where the arm is before it.
+    pub fn on_motion(&mut self, order: &MotionOrder, at_home: &AtHome) {
         if let MotionOrder::Proposal(proposal) = order {
             self.picked = self.seen.as_ref().map(|(seen, _)| Picked {
                 tip: proposal.action.tips().0,
                 seen: Arc::clone(seen),
+                at_home: *at_home,
             });
         }
     }
@@ -310,16 +318,48 @@ mod tests {
         assert!(rehearsals.robot(reading()).without_arm.is_none());
         at_home.read(Duration::from_secs(2), &home, &Joints::zeros(), &home);
         rehearsals.on_heightmap(Duration::from_secs(3), &second, 1, &at_home);
-        rehearsals.on_motion(&MotionOrder::Proposal(Box::new(proposal(ID))));
-        rehearsals.on_heightmap(Duration::from_secs(4), &first, 1, &AtHome::default());
+        rehearsals.on_motion(&MotionOrder::Proposal(Box::new(proposal(ID))), &at_home);
+        let away = AtHome::default();
+        rehearsals.on_heightmap(Duration::from_secs(4), &first, 1, &away);
         // A way home picks nothing.
-        rehearsals.on_motion(&MotionOrder::Home(ProposalId(8)));
+        rehearsals.on_motion(&MotionOrder::Home(ProposalId(8)), &away);
         let robot = rehearsals.robot(reading());
         assert!(Arc::ptr_eq(&robot.without_arm.unwrap(), &second));
         let picked = robot.picked.unwrap();
         assert!(Arc::ptr_eq(&picked.seen, &second));
         assert_eq!(picked.tip, proposal(ID).action.tips().0);
         assert!(Arc::ptr_eq(&robot.seen.unwrap().0, &first));
+    }
+
+    #[test]
+    fn a_view_that_comes_as_the_motion_begins_shows_what_is_picked_where_it_was() {
+        let mut rehearsals = rehearsals();
+        let home = WorkCell::builtin().unwrap().arm.home;
+        let mut at_home = AtHome::default();
+        let mut read = |second, offset_rad| {
+            let positions = home.add_scalar(offset_rad);
+            at_home.read(
+                Duration::from_secs(second),
+                &positions,
+                &Joints::zeros(),
+                &home,
+            );
+            at_home
+        };
+        let [before, late, after] = [(); 3].map(|()| table());
+        let at_first = read(1, 0.0);
+        rehearsals.on_heightmap(Duration::from_secs(2), &before, 1, &at_first);
+        rehearsals.on_motion(&MotionOrder::Proposal(Box::new(proposal(ID))), &at_first);
+        rehearsals.on_heightmap(Duration::from_secs(3), &late, 1, &at_first);
+        let picked = rehearsals.robot(reading()).picked.unwrap();
+        assert!(Arc::ptr_eq(&picked.seen, &late));
+        // The arm has been away, and what it holds is no longer where it was.
+        read(4, 0.1);
+        let at_last = read(5, 0.0);
+        rehearsals.on_heightmap(Duration::from_secs(6), &after, 1, &at_last);
+        let robot = rehearsals.robot(reading());
+        assert!(Arc::ptr_eq(&robot.picked.unwrap().seen, &late));
+        assert!(Arc::ptr_eq(&robot.without_arm.unwrap(), &after));
     }
 
     #[test]

@@ -37,8 +37,10 @@ const SLOW_FROM_M: f64 = 0.03;
 pub struct Picked {
     /// Pose of the tip in the world's xy-plane.
     pub tip: Isometry2<f64>,
-    /// The newest heightmap when the motion began.
+    /// The newest heightmap from before the arm left home for it.
     pub seen: Arc<Heightmap>,
+    /// Where the arm was when the motion began.
+    pub at_home: AtHome,
 }
 
 /// What is rehearsed.
@@ -555,7 +557,11 @@ mod tests {
         robot.without_arm = Some(Arc::clone(&seen));
         robot.dry_run_home().unwrap();
         let tip = Isometry2::new(Vector2::new(0.5, 0.1), 0.0);
-        robot.picked = Some(Picked { tip, seen });
+        robot.picked = Some(Picked {
+            tip,
+            seen,
+            at_home: AtHome::default(),
+        });
         robot.holds = Some(true);
         let (carried, rest) = robot.lifted_out(true).unwrap();
         assert!((0.02..0.05).contains(&carried.radius_m()), "{carried:?}");
@@ -585,7 +591,11 @@ mod tests {
         robot.holds = Some(true);
         let reason = recovery(&robot, Recovery::PutDown).unwrap_err();
         assert!(reason.contains("nobody saw"), "{reason}");
-        robot.picked = Some(Picked { tip, seen });
+        robot.picked = Some(Picked {
+            tip,
+            seen,
+            at_home: AtHome::default(),
+        });
         let motion = robot.dry_run_put_down().unwrap();
         assert!((robot.put_down().unwrap().contact_m - 0.04).abs() < 1e-6);
         // Suction is switched off where the cup was at the pick, and the arm ends at home.

@@ -215,9 +215,10 @@ impl ActiveNode<'_> {
     pub(super) fn begin(&mut self, order: MotionOrder) {
         let cause = order.cause();
         info!("proposal {}: the arm {}", cause.id(), cause.text());
-        self.rehearsals.on_motion(&order);
-        let robot_now = self.robot();
         let driver = &self.configured.driver;
+        let at_home = driver.status.borrow().at_home;
+        self.rehearsals.on_motion(&order, &at_home);
+        let robot_now = self.robot();
         let motion = RunningMotion::begin(&self.node, driver, move |robot, observe| {
             robot_now.carry_out(&order, robot, DriverError::Fault, observe)
         });

@@ -8,7 +8,11 @@ use bags::Demonstration;
 use camera_noise::Perturbation;
 use clap::Args;
 use cpu_time::ProcessTime;
-use learning::{demonstrate, demonstrate_disturbed, demonstration_path, replay, wilson_95};
+use gctn::Policy;
+use learning::{
+    Actor, Rollout, demonstrate, demonstrate_corrections, demonstrate_disturbed,
+    demonstration_path, replay, wilson_95,
+};
 use multiravens::{Care, Environment, EpisodeSeed, Problem};
 use serde::Serialize;
 use std::path::{Path, PathBuf};
@@ -36,6 +40,10 @@ pub struct Demos {
     /// demonstration, which goes on from the result. With --starts the demonstration that sets the order stays clean
     #[arg(long, default_value_t = 0.0, value_parser = probability)]
     disturb: f64,
+    /// The policy of this checkpoint, shown the first demonstration of the scene, acts before each step. Where it makes a mistake the demonstration
+    /// goes on from the result; of the other starts only demonstrations in which it made one are kept
+    #[arg(long, value_name = "CHECKPOINT", conflicts_with = "disturb")]
+    mistakes_of: Option<PathBuf>,
     /// Make more sure of moves of chains and cables: each succeeds in five rehearsals too, gripped and set down within 6 mm of
     /// what is meant, as a policy may miss [default: two rehearsals within 1 mm]
     #[arg(long)]
@@ -79,6 +87,22 @@ struct Report {
     cpu_seconds: f64,
 }
 
+/// What the other starts of a scene go by.
+struct Lead {
+    demonstration: Demonstration,
+    /// The order in which it reaches the goals; `None` where no other start can follow it.
+    order: Option<Vec<usize>>,
+}
+
+impl Lead {
+    fn new(rollout: Rollout) -> Self {
+        Self {
+            order: rollout.goal_order(),
+            demonstration: rollout.demonstration,
+        }
+    }
+}
+
 struct Episode {
     /// Number of the start, from 0: the scene's own.
     start: u64,
@@ -100,6 +124,11 @@ impl Demos {
         let work_cell = root.work_cell()?;
         let perturbation = self.perturb.as_deref().map(Perturbation::load);
         let perturbation = perturbation.transpose()?;
+        if self.mistakes_of.is_some() && self.starts == 1 {
+            bail!(
+                "--mistakes-of needs --starts of 2 or more: the policy is shown the demonstration of another start"
+            );
+        }
         let cores = std::thread::available_parallelism().map_or(1, |cores| cores.get());
         let threads = self.threads.unwrap_or(cores).max(1);
         let bar = progress::bar(count * self.starts, "demonstrations");
@@ -115,16 +144,18 @@ impl Demos {
             } else {
                 Care::Usual
             });
+            let policy = self.mistakes_of.as_deref().map(Policy::load).transpose()?;
+            let actor = policy.map(Actor::from);
             while !stop.load(Ordering::Relaxed) {
                 let index = next.fetch_add(1, Ordering::Relaxed);
                 if index >= count {
                     break;
                 }
                 let scene = first_seed + 2 * index;
-                let mut order = None;
+                let mut lead = None;
                 for start in 0..self.starts {
                     let episode = self
-                        .episode(&mut environment, scene, start, &mut order)
+                        .episode(&mut environment, actor.as_ref(), scene, start, &mut lead)
                         .inspect_err(|_| stop.store(true, Ordering::Relaxed))?;
                     episodes
                         .lock()
@@ -191,9 +222,10 @@ impl Demos {
     fn episode(
         &self,
         environment: &mut Environment,
+        actor: Option<&Actor>,
         scene: u64,
         start: u64,
-        order: &mut Option<Vec<usize>>,
+        lead: &mut Option<Lead>,
     ) -> Result<Episode> {
         let seed = EpisodeSeed {
             scene,
@@ -214,27 +246,39 @@ impl Demos {
         {
             let found = Demonstration::read(path)
                 .with_context(|| format!("{}: remove it to make it anew", path.display()))?;
-            if self.starts > 1 && order.is_none() {
-                let replayed = replay(environment, &found).with_context(context)?;
-                *order = replayed.goal_order();
+            if self.starts > 1 && lead.is_none() {
+                *lead = Some(Lead::new(
+                    replay(environment, &found).with_context(context)?,
+                ));
             }
             episode.steps = found.steps.len() as u64;
             episode.bytes = size(path)?;
             return Ok(episode);
         }
         environment.set_session(start);
-        let known = order.as_deref().unwrap_or_default();
+        let order = lead.as_ref().and_then(|lead| lead.order.as_deref());
+        let known = order.unwrap_or_default();
         let leads = self.starts > 1 && order.is_none();
-        let disturb = if leads { 0.0 } else { self.disturb };
-        let rollout =
-            demonstrate_disturbed(environment, seed, known, disturb).with_context(context)?;
-        episode.complete = rollout.complete;
+        let (rollout, is_wanted) = match (actor, lead.as_ref()) {
+            (Some(actor), Some(lead)) if !leads => {
+                let shown = (&lead.demonstration, known);
+                let corrected = demonstrate_corrections(environment, actor, seed, shown);
+                let corrected = corrected.with_context(context)?;
+                (corrected.rollout, corrected.mistakes > 0)
+            }
+            _ => {
+                let disturb = if leads { 0.0 } else { self.disturb };
+                let rollout = demonstrate_disturbed(environment, seed, known, disturb);
+                (rollout.with_context(context)?, true)
+            }
+        };
+        episode.complete = rollout.complete && is_wanted;
         if self.starts > 1 && rollout.complete {
             let reached = rollout.goal_order();
-            let follows = order.is_none() || reached == *order;
-            episode.complete = reached.is_some() && follows;
-            if episode.complete {
-                *order = reached;
+            let follows = order.is_none_or(|order| reached.as_deref() == Some(order));
+            episode.complete &= reached.is_some() && follows;
+            if leads && episode.complete {
+                *lead = Some(Lead::new(rollout.clone()));
             }
         }
         if !episode.complete {

@@ -103,3 +103,38 @@ fn an_unknown_problem_is_told_with_those_that_there_are() {
         "{said}"
     );
 }
+
+/// A policy of *placing* is no good at *stacking*.
+#[test]
+fn a_demonstration_goes_on_from_the_mistakes_of_a_policy() {
+    let folder = tempfile::tempdir().unwrap();
+    let run = |starts: &str, out: &str, more: &[&str]| {
+        Command::new(env!("CARGO_BIN_EXE_sctn"))
+            .args(["--root", ROOT, "demos", "--problem", "stacking"])
+            .args(["--seed", "20", "--episodes", "1", "--threads", "1"])
+            .args(["--starts", starts])
+            .args(more)
+            .arg("--out")
+            .arg(folder.path().join(out))
+            .output()
+            .unwrap()
+    };
+    let checkpoint = format!("{ROOT}/config/checkpoints/placing.safetensors");
+    let mistakes = ["--mistakes-of", &checkpoint];
+    let refused = run("1", "mistakes", &mistakes);
+    let said = String::from_utf8_lossy(&refused.stderr);
+    assert!(!refused.status.success());
+    assert!(said.contains("--starts of 2 or more"), "{said}");
+    assert!(run("2", "mistakes", &mistakes).status.success());
+    assert!(run("2", "clean", &[]).status.success());
+    let [corrected, clean] = ["mistakes", "clean"].map(|out| {
+        let bag = folder.path().join(out).join("stacking/000020_000022");
+        Demonstration::read(&bag).unwrap()
+    });
+    assert_eq!(corrected.steps.len(), clean.steps.len());
+    for step in &corrected.steps {
+        assert!(step.delta_reward > 0.0, "the policy's actions are no steps");
+    }
+    let [begin, start] = [&corrected, &clean].map(|shown| &shown.observation(0).height_m);
+    assert_ne!(begin, start, "the policy was not there");
+}

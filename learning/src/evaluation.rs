@@ -149,9 +149,23 @@ const MAX_SEEDS_PER_EPISODE: u64 = 10;
 const SESSION_OF_DEMONSTRATION: u64 = 0;
 const SESSION_OF_ROLLOUT: u64 = 1;
 
-enum StepError {
+/// What went wrong in a step.
+pub(crate) enum StepError {
     Environment(EnvironmentError),
     Policy(gctn::Error),
+}
+
+impl StepError {
+    /// In the episode of this seed.
+    pub(crate) fn of(self, seed: u64) -> EvaluationError {
+        match self {
+            Self::Environment(source) => EvaluationError::Environment {
+                seed,
+                source: Box::new(source),
+            },
+            Self::Policy(source) => EvaluationError::Policy { seed, source },
+        }
+    }
 }
 
 impl From<EnvironmentError> for StepError {
@@ -206,7 +220,7 @@ pub fn attempt(
     let first = demonstration.observation(0);
     let mut image_distance_right = 0;
     let said_steps: RefCell<Vec<SaidStep>> = RefCell::default();
-    let rollout = roll_out(
+    let rollout: Result<_, StepError> = roll_out(
         environment,
         seed,
         |_, observation| {
@@ -254,11 +268,7 @@ pub fn attempt(
             image_distance_right,
             said: said_steps.into_inner(),
         })),
-        Err(StepError::Environment(source)) => Err(EvaluationError::Environment {
-            seed,
-            source: Box::new(source),
-        }),
-        Err(StepError::Policy(source)) => Err(EvaluationError::Policy { seed, source }),
+        Err(error) => Err(error.of(seed)),
     }
 }
 

@@ -8,6 +8,7 @@ mod evaluation;
 mod goal;
 mod images;
 mod interval;
+mod mistakes;
 mod recipe;
 mod reliability;
 mod rollout;
@@ -33,6 +34,7 @@ pub use evaluation::{
 pub use goal::{goal, known_images, reached};
 pub use images::ImageMemory;
 pub use interval::{bootstrap_95, wilson_95};
+pub use mistakes::{Corrected, demonstrate_corrections};
 pub use recipe::{Demonstrations, Recipe, RecipeError, Validation};
 pub use reliability::{Reliability, ReliabilityBin, Unasked, reliability};
 pub use rollout::{

@@ -106,7 +106,7 @@ pub fn roll_out<E: From<EnvironmentError>>(
 }
 
 /// [`roll_out`]; `before` is called before each step, and says whether it has moved anything.
-fn roll<E: From<EnvironmentError>>(
+pub(crate) fn roll<E: From<EnvironmentError>>(
     environment: &mut Environment,
     seed: EpisodeSeed,
     mut before: impl FnMut(&mut Environment) -> Result<bool, E>,

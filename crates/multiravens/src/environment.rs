@@ -407,6 +407,37 @@ impl Environment {
         Ok(true)
     }
 
+    /// Carries out what somebody else would do where it reaches no further goal. That is no step of the episode, and the demonstrator goes
+    /// on from what came of it. Says whether it was such a mistake: nothing has moved where it was none.
+    ///
+    /// # Errors
+    /// The action is outside the workspace, or cannot be simulated.
+    pub fn mistake(&mut self, action: &PickPlace) -> Result<bool, EnvironmentError> {
+        check(action)?;
+        let Some(settings) = self.settings() else {
+            return Ok(false);
+        };
+        let rehearsal = self.cell.rehearse(action, &settings)?;
+        let mut reaches_more = false;
+        for progress in &mut self.tasks {
+            let goals = progress.task.goals_reached(rehearsal.world());
+            reaches_more |= goals.iter().any(|goal| !progress.reached.contains(goal));
+        }
+        if reaches_more {
+            // A task remembers the last world that it was asked about.
+            for progress in &mut self.tasks {
+                progress.task.goals_reached(self.cell.world());
+            }
+            return Ok(false);
+        }
+        self.cached_rehearsal = None;
+        self.cell.adopt(rehearsal);
+        for progress in &mut self.tasks {
+            progress.reached = progress.task.goals_reached(self.cell.world());
+        }
+        Ok(true)
+    }
+
     /// Carries out an action with the settings of the module being solved, and assesses it. What the
     /// demonstrator has just rehearsed is not simulated again.
     pub fn step(&mut self, action: &PickPlace) -> Result<StepReport, EnvironmentError> {

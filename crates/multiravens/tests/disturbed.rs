@@ -46,3 +46,28 @@ fn demonstrators_go_on_from_what_a_disturbance_has_left() {
 fn without_a_disturbance_nothing_changes() {
     assert_eq!(solve("placing", 1, 0.0), (0, true));
 }
+
+/// Where nothing is gripped the action is a mistake; where the demonstrator's is taken for one it is none.
+#[test]
+fn a_mistake_is_carried_out_and_what_reaches_a_goal_is_not() {
+    for problem in ["stacking", "chaining", "routing"] {
+        let mut environment = episode::environment(problem);
+        environment.reset(1).unwrap();
+        let good = environment.demonstrate().unwrap();
+        let before = environment.state_hash();
+        assert!(!environment.mistake(&good).unwrap());
+        assert_eq!(environment.state_hash(), before, "{problem}");
+        let mut bad = good;
+        // Back to where it was picked.
+        bad.place = bad.pick;
+        assert!(environment.mistake(&bad).unwrap());
+        assert_ne!(environment.state_hash(), before, "{problem}");
+        assert_eq!(environment.steps(), 0, "a mistake is no step");
+        while let Some(action) = environment.demonstrate() {
+            environment.step(&action).unwrap();
+        }
+        assert!(environment.is_complete(), "{problem}");
+        bad.place.translation.x = 7.0;
+        assert!(environment.mistake(&bad).is_err());
+    }
+}

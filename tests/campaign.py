@@ -32,6 +32,7 @@ import lossy_link
 from campaign_cell import Bench, Layout, begin, begin_from_home, recover, working_cell
 from campaign_faults import (
     FAULTS,
+    GONE,
     LAYOUTS,
     Fault,
     another_executor,
@@ -322,8 +323,9 @@ def main() -> int:
     parser.add_argument("--faults", type=int, default=20)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--log", type=pathlib.Path, help="append a line of JSON for each fault; those in the file are left out")
-    names = {fault.__name__: fault for fault in FAULTS}
-    parser.add_argument("--kinds", nargs="+", choices=names, default=list(names), metavar="KIND", help=f"only these: {', '.join(names)}")
+    names = {fault.__name__: fault for fault in [*FAULTS, *GONE]}
+    usual = [fault.__name__ for fault in FAULTS]
+    parser.add_argument("--kinds", nargs="+", choices=names, default=usual, metavar="KIND", help=f"only these: {', '.join(names)}")
     parser.add_argument("--minutes", type=float, default=float("inf"), help="end after so long; with --log the next call goes on")
     parser.add_argument("--cells", type=int, default=1, help="how many cells run side by side; each takes a fifth of a core")
     parser.add_argument("--numbers", type=int, nargs="+", help="only the faults of these numbers")

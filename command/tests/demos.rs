@@ -104,7 +104,7 @@ fn an_unknown_problem_is_told_with_those_that_there_are() {
     );
 }
 
-/// A policy of *placing* is no good at *stacking*.
+/// A policy that is shown no image before its goal is no good at another start.
 #[test]
 fn a_demonstration_goes_on_from_the_mistakes_of_a_policy() {
     let folder = tempfile::tempdir().unwrap();
@@ -119,22 +119,21 @@ fn a_demonstration_goes_on_from_the_mistakes_of_a_policy() {
             .output()
             .unwrap()
     };
-    let checkpoint = format!("{ROOT}/config/checkpoints/placing.safetensors");
+    let checkpoint = format!("{ROOT}/config/checkpoints/ten_problems.safetensors");
     let mistakes = ["--mistakes-of", &checkpoint];
     let refused = run("1", "mistakes", &mistakes);
     let said = String::from_utf8_lossy(&refused.stderr);
     assert!(!refused.status.success());
     assert!(said.contains("--starts of 2 or more"), "{said}");
-    assert!(run("2", "mistakes", &mistakes).status.success());
-    assert!(run("2", "clean", &[]).status.success());
+    assert!(run("3", "mistakes", &mistakes).status.success());
+    assert!(run("3", "clean", &[]).status.success());
     let [corrected, clean] = ["mistakes", "clean"].map(|out| {
-        let bag = folder.path().join(out).join("stacking/000020_000022");
+        let bag = folder.path().join(out).join("stacking/000020_000024");
         Demonstration::read(&bag).unwrap()
     });
-    assert_eq!(corrected.steps.len(), clean.steps.len());
-    for step in &corrected.steps {
-        assert!(step.delta_reward > 0.0, "the policy's actions are no steps");
-    }
+    // The policy's actions are no steps; what it has put in the way is put aside.
+    assert_eq!(corrected.goals().len(), clean.goals().len());
+    assert!(corrected.steps.len() < clean.steps.len() + 3);
     let [begin, start] = [&corrected, &clean].map(|shown| &shown.observation(0).height_m);
     assert_ne!(begin, start, "the policy was not there");
 }

@@ -2,6 +2,7 @@
 
 use bags::Demonstration;
 use multiravens::{Environment, EpisodeSeed};
+use nalgebra::{Isometry2, Point2};
 
 use crate::evaluation::{EvaluationError, StepError};
 use crate::rollout::roll;
@@ -43,7 +44,17 @@ pub fn demonstrate_corrections(
             mistakes += usize::from(is_mistake);
             Ok(is_mistake)
         },
-        |environment, _| Ok::<_, StepError>(environment.demonstrate()),
+        |environment, observation| {
+            // What the policy has pushed over the edge cannot be picked.
+            let is_inside = |pose: &Isometry2<f64>| {
+                let point = Point2::from(pose.translation.vector);
+                observation.workspace.pixel(&point).is_some()
+            };
+            let action = environment.demonstrate();
+            let action =
+                action.filter(|action| is_inside(&action.pick) && is_inside(&action.place));
+            Ok::<_, StepError>(action)
+        },
         |_, _| (),
     );
     match rollout {

@@ -608,11 +608,14 @@ fn an_approval_that_the_executor_does_not_carry_out_is_asked_for_again() {
 #[test]
 fn a_decision_that_the_oracle_does_not_answer_is_asked_for_again() {
     let late = NOW + Duration::from_secs(7);
+    // A rejection that the executor has taken is the page's to repeat, not the person's.
     let mut run = proposed();
     run.on_confirmation(&confirmation(7, Decision::Reject), NOW);
     run.on_result(&result(7, StepOutcome::Rejected, 11), NOW);
-    assert_eq!(run.ask_again(late), Some(id(7)));
-    assert_eq!(run.phase(), RunPhase::Proposed);
+    assert_eq!(run.ask_again(late), None);
+    assert_eq!(run.phase(), RunPhase::AwaitingProposal);
+    assert_eq!(run.probe(late), None);
+    assert_eq!(run.probe(late + Duration::from_secs(11)), Some(id(7)));
 
     let mut run = proposed();
     run.on_confirmation(&confirmation(7, Decision::Approve), NOW);

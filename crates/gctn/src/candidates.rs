@@ -845,8 +845,8 @@ mod tests {
 
     #[test]
     fn cells_turn_what_the_features_are_unsure_of_and_leave_what_they_are_sure_of() {
-        let shown = turned_square(8.3, (45.0, 22.0), 1);
-        assert_eq!(best_of(&logits_of_a_square(&shown, 9.0)), (1, 45, 22));
+        let shown = turned_square(8.3, (45.0, 22.0), 2);
+        assert_eq!(best_of(&logits_of_a_square(&shown, 9.0)), (2, 45, 22));
         assert_eq!(best_of(&logits_of_a_square(&shown, 9.5)).0, 5);
     }
 

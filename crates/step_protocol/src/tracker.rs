@@ -267,7 +267,8 @@ impl GoalTracker {
         self.moved_until
     }
 
-    /// Publishes the goal of another step; the present one changes nothing unless the run has ended.
+    /// Publishes the goal of a step. The present one is published again, with a further attempt, where the run has ended or
+    /// something was proposed for it: what the arm did since may be known to nobody, as after a start in mid-motion.
     ///
     /// # Errors
     /// There is no such step.
@@ -277,7 +278,7 @@ impl GoalTracker {
             return Err(NoSuchStep { step, count });
         }
         let index = step as usize - 1;
-        if index == self.reached && !self.stopped {
+        if index == self.reached && !self.stopped && self.current.is_none() {
             return Ok(Change::None);
         }
         Ok(self.restart_at(index))

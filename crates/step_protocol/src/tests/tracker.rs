@@ -390,6 +390,19 @@ fn a_tracker_that_is_started_again_takes_no_attempt_that_somebody_has_proposed_f
 }
 
 #[test]
+fn the_present_step_is_published_again_where_something_was_proposed_for_it() {
+    let mut tracker = tracker(3);
+    assert_eq!(tracker.set_step(1), Ok(Change::None));
+    // Made, and carried out, before this tracker was started again: nobody says so any more.
+    tracker.on_proposal(&proposal(7, 1, 0));
+    assert_eq!(goal(tracker.set_step(1).unwrap()), (1, 1, 0, false));
+    assert_eq!(tracker.set_step(1), Ok(Change::None));
+    tracker.on_proposal(&proposal(8, 1, 1));
+    tracker.on_result(&result(8, StepOutcome::GraspFailed, 5));
+    assert_eq!(goal(tracker.set_step(1).unwrap()), (1, 0, 5, false));
+}
+
+#[test]
 fn a_step_that_is_set_ends_a_stop_and_a_completed_run() {
     let mut tracker = tracker(1);
     tracker.on_proposal(&proposal(7, 1, 0));

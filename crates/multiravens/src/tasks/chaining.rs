@@ -9,7 +9,7 @@
 //! side of -y.
 
 use super::{
-    Demonstrator, Move, ParameterError, Task, TaskModule, at_height, check_range, rehearsed,
+    Care, Demonstrator, Move, ParameterError, Task, TaskModule, at_height, check_range, rehearsed,
 };
 use crate::cell::Cell;
 use crate::colors;
@@ -324,6 +324,20 @@ impl ChainingTask {
         wrapped.map(|(index, _)| index).collect()
     }
 
+    /// The bead that belongs beyond a peg, in a direction turned from outwards by an angle, and a place so far from the peg's axis.
+    fn beyond_peg(
+        &self,
+        peg: Peg,
+        beads: &[Point2<f64>],
+        angle_rad: f64,
+        reach_m: f64,
+    ) -> (usize, Point2<f64>) {
+        let center = self.pegs.center(peg);
+        let outward = Vector2::new(peg.side() * angle_rad.cos(), angle_rad.sin());
+        let bead = self.bead_for(&(center + outward * self.pegs.touch_m()), beads);
+        (bead, center + outward * reach_m)
+    }
+
     /// A move that may wrap a peg: which bead, and where it goes. The bead that belongs beyond the
     /// peg goes there; a wide guess takes one near it, in a direction that is further off, or one
     /// next to the peg across it.
@@ -347,10 +361,15 @@ impl ChainingTask {
         }
         let (least, most) = if wide { WIDE_ANGLE_RAD } else { ANGLE_RAD };
         let angle = rng.random_range(least..most);
-        let outward = Vector2::new(peg.side() * angle.cos(), angle.sin());
-        let bead = self.bead_for(&(center + outward * self.pegs.touch_m()), beads);
+        let (bead, place) = self.beyond_peg(peg, beads, angle, reach);
         let bead = if wide { near(bead) } else { bead };
-        Some((bead, center + outward * reach))
+        Some((bead, place))
+    }
+
+    /// The move in the middle of what narrow guesses are drawn from.
+    fn middle(&self, peg: Peg, beads: &[Point2<f64>]) -> (usize, Point2<f64>) {
+        let [angle, room] = [ANGLE_RAD, ROOM_M].map(|(least, most)| (least + most) / 2.0);
+        self.beyond_peg(peg, beads, angle, self.pegs.touch_m() + room)
     }
 
     /// Whether the chain crosses itself, but for kinks too short to go round a peg.
@@ -441,9 +460,14 @@ impl Task for ChainingTask {
         let open: Vec<_> = open.copied().collect();
         let open = if open.is_empty() { candidates } else { open };
         let pose = |p: Point2<f64>| Isometry2::new((self.frame * p).coords, 0.0);
+        let begins_in_the_middle = demonstrator.care == Care::Careful;
         let guess = |index: usize, rng: &mut ChaCha8Rng| {
             let peg = *open.choose(rng)?;
-            let (bead, place) = self.guess(peg, index >= NARROW_GUESSES, &beads, rng)?;
+            let (bead, place) = if begins_in_the_middle && index == 0 {
+                self.middle(peg, &beads)
+            } else {
+                self.guess(peg, index >= NARROW_GUESSES, &beads, rng)?
+            };
             Some(PickPlace {
                 pick: pose(beads[bead]),
                 place: pose(place),

@@ -54,8 +54,7 @@ impl ConsoleCommand {
             .context("tokio runtime")?;
         runtime.block_on(async {
             let context = Context::from_environment()?;
-            let mut node =
-                context.start("operator_console", &arguments, operator_console::configure)?;
+            let mut node = operator_console::start(&context, &arguments)?;
             tokio::select! {
                 ended = &mut node => ended.context("the console panicked")?,
                 signal = wait_for_end() => {

@@ -97,11 +97,7 @@ impl Chain {
             "-p".into(),
             format!("frames:={frames}"),
         ];
-        context.start(
-            "camera_fusion",
-            &arguments(&words)?,
-            camera_fusion::configure,
-        )?;
+        camera_fusion::start(&context, &arguments(&words)?)?;
         let given = format!("checkpoint:={}", checkpoint.display());
         let words = [
             "--ros-args".to_owned(),
@@ -110,7 +106,7 @@ impl Chain {
             "-p".into(),
             given,
         ];
-        context.start("gctn_policy", &arguments(&words)?, gctn_policy::configure)?;
+        gctn_policy::start(&context, &arguments(&words)?)?;
 
         let (node, _) = context.node::<NoParameters>("sctn_bench", &RosArguments::default())?;
         let transforms = node.publisher::<TFMessage>("/tf_static", Qos::Latched)?;

@@ -155,12 +155,12 @@ pub fn start(
     arguments: &RosArguments,
 ) -> Result<JoinHandle<Result<()>>> {
     match node {
-        "sim_workcell" => context.start(node, arguments, sim_workcell::configure),
-        "camera_fusion" => context.start(node, arguments, camera_fusion::configure),
-        "goal_oracle" => context.start(node, arguments, goal_oracle::configure),
-        "gctn_policy" => context.start(node, arguments, gctn_policy::configure),
-        "operator_console" => context.start(node, arguments, operator_console::configure),
-        _ => context.start(node, arguments, suction_executor::configure),
+        "sim_workcell" => sim_workcell::start(context, arguments),
+        "camera_fusion" => camera_fusion::start(context, arguments),
+        "goal_oracle" => goal_oracle::start(context, arguments),
+        "gctn_policy" => gctn_policy::start(context, arguments),
+        "operator_console" => operator_console::start(context, arguments),
+        _ => suction_executor::start(context, arguments),
     }
 }
 

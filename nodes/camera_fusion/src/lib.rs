@@ -24,6 +24,8 @@ use node_kit::{
     Active, Clock, ImageSubscription, Level, Node, NodeError, Publisher, Qos, Statistics,
     ns_from_stamp,
 };
+#[cfg(not(test))]
+use node_kit::{Context, NodeLife, RosArguments};
 use tokio::sync::mpsc;
 use tracing::{info, warn};
 
@@ -44,6 +46,12 @@ const START_PATIENCE: Duration = Duration::from_secs(5);
 enum Arrival {
     Image(usize, Stream, Image),
     Info(usize, Stream, Box<CameraInfo>),
+}
+
+/// Starts the node in a context. It is compiled here, once, and not anew in every program that has it; tests of this library have no use for it.
+#[cfg(not(test))]
+pub fn start(context: &Context, arguments: &RosArguments) -> anyhow::Result<NodeLife> {
+    context.start("camera_fusion", arguments, configure)
 }
 
 /// Reads the calibration and returns the node that fuses.

@@ -3,5 +3,5 @@
 use std::process::ExitCode;
 
 fn main() -> ExitCode {
-    node_kit::main("camera_fusion", camera_fusion::configure)
+    node_kit::main::<camera_fusion::CameraFusionParameters>("camera_fusion", camera_fusion::start)
 }

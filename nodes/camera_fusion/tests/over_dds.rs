@@ -2,7 +2,6 @@
 
 use std::time::{Duration, Instant};
 
-use camera_fusion::CameraFusionParameters;
 use heightmap::{Camera, Intrinsics};
 use msgs::{
     convert,
@@ -58,13 +57,7 @@ impl CameraDriver {
 async fn three_cameras_become_one_heightmap_in_time() {
     let context = Context::new(Network::unused().unwrap());
     let arguments = RosArguments::default();
-    let fusion = context
-        .start(
-            "camera_fusion",
-            &arguments,
-            |node, parameters: CameraFusionParameters| camera_fusion::configure(node, parameters),
-        )
-        .unwrap();
+    let fusion = camera_fusion::start(&context, &arguments).unwrap();
     let (node, _) = context.node::<NoParameters>("driver", &arguments).unwrap();
     let drivers = ["front", "left", "right"].map(|name| CameraDriver::new(&node, name));
     let transforms = node.publisher("/tf_static", Qos::Latched).unwrap();

@@ -25,6 +25,8 @@ use msgs::{
     visualization_msgs::MarkerArray,
 };
 use node_kit::{Active, Level, NewRequest, Node, Publisher, Qos, ReplyCache};
+#[cfg(not(test))]
+use node_kit::{Context, NodeLife, RosArguments};
 use step_protocol::{Job, PlannerRules, Prediction, Proposal, ProposalPlanner};
 use tokio::sync::mpsc;
 use tracing::{info, warn};
@@ -47,6 +49,12 @@ struct Answer {
     checkpoint: PathBuf,
     decision: Result<Decision, String>,
     took: Duration,
+}
+
+/// Starts the node in a context. It is compiled here, once, and not anew in every program that has it; tests of this library have no use for it.
+#[cfg(not(test))]
+pub fn start(context: &Context, arguments: &RosArguments) -> anyhow::Result<NodeLife> {
+    context.start("gctn_policy", arguments, configure)
 }
 
 /// Loads the checkpoint; returns the node that proposes.

@@ -3,5 +3,5 @@
 use std::process::ExitCode;
 
 fn main() -> ExitCode {
-    node_kit::main("gctn_policy", gctn_policy::configure)
+    node_kit::main::<gctn_policy::GctnPolicyParameters>("gctn_policy", gctn_policy::start)
 }

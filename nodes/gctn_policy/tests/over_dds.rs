@@ -3,7 +3,6 @@
 use std::time::{Duration, Instant};
 
 use gctn::{Compact, ModelCard, Network, NetworkConfig, Storage, Trainer, TrainingConfig};
-use gctn_policy::GctnPolicyParameters;
 use heightmap::Workspace;
 use msgs::{
     convert,
@@ -149,13 +148,7 @@ async fn proposals_follow_goals_rejections_and_changed_scenes() {
         }],
         ..RosArguments::default()
     };
-    let policy = context
-        .start(
-            "gctn_policy",
-            &arguments,
-            |node, parameters: GctnPolicyParameters| gctn_policy::configure(node, parameters),
-        )
-        .unwrap();
+    let policy = gctn_policy::start(&context, &arguments).unwrap();
 
     // Of another size: no proposal, and the node lives on.
     goals.publish(goal(0));
@@ -246,13 +239,7 @@ async fn proposals_follow_goals_rejections_and_changed_scenes() {
 #[tokio::test(flavor = "multi_thread")]
 async fn without_a_checkpoint_the_node_refuses_to_start() {
     let context = Context::new(DdsNetwork::unused().unwrap());
-    let policy = context
-        .start(
-            "gctn_policy",
-            &RosArguments::default(),
-            |node, parameters: GctnPolicyParameters| gctn_policy::configure(node, parameters),
-        )
-        .unwrap();
+    let policy = gctn_policy::start(&context, &RosArguments::default()).unwrap();
     let error = policy.await.unwrap().unwrap_err().to_string();
     assert!(error.contains("checkpoint"), "{error}");
 }
@@ -278,11 +265,7 @@ async fn a_device_that_cannot_be_used_keeps_the_node_from_starting() {
             ..RosArguments::default()
         };
         let context = Context::new(DdsNetwork::unused().unwrap());
-        let policy = context.start(
-            "gctn_policy",
-            &arguments,
-            |node, parameters: GctnPolicyParameters| gctn_policy::configure(node, parameters),
-        );
+        let policy = gctn_policy::start(&context, &arguments);
         let error = match policy {
             Ok(policy) => format!("{:#}", policy.await.unwrap().unwrap_err()),
             Err(error) => format!("{error:#}"),
@@ -320,9 +303,7 @@ async fn a_heightmap_that_may_show_the_arm_makes_no_proposal() {
         "observation_needs_home:=true",
     ];
     let arguments = RosArguments::parse(line.map(String::from)).unwrap().0;
-    let policy = context
-        .start("gctn_policy", &arguments, gctn_policy::configure)
-        .unwrap();
+    let policy = gctn_policy::start(&context, &arguments).unwrap();
     let graph = node.graph();
     assert!(
         graph

@@ -18,6 +18,8 @@ use msgs::{
     },
 };
 use node_kit::{Active, Level, Node, Publisher, Qos, ReplyCache, Subscription};
+#[cfg(not(test))]
+use node_kit::{Context, NodeLife, RosArguments};
 use step_protocol::{
     Capture, Change, ConfirmationRefusal, GoalSequence, GoalTracker, Observation, ProposalId,
     StepJudge,
@@ -28,6 +30,12 @@ pub use parameters::{GoalModule, GoalOracleParameters};
 
 /// How long the first goal waits for policy and executor, so that none of their first words is lost.
 const PEERS: Duration = Duration::from_secs(5);
+
+/// Starts the node in a context. It is compiled here, once, and not anew in every program that has it; tests of this library have no use for it.
+#[cfg(not(test))]
+pub fn start(context: &Context, arguments: &RosArguments) -> anyhow::Result<NodeLife> {
+    context.start("goal_oracle", arguments, configure)
+}
 
 /// Reads the demonstration; returns the node that walks through its goals.
 pub async fn configure(node: Node, parameters: GoalOracleParameters) -> anyhow::Result<OracleNode> {

@@ -3,5 +3,5 @@
 use std::process::ExitCode;
 
 fn main() -> ExitCode {
-    node_kit::main("goal_oracle", goal_oracle::configure)
+    node_kit::main::<goal_oracle::GoalOracleParameters>("goal_oracle", goal_oracle::start)
 }

@@ -3,7 +3,6 @@
 use std::time::Duration;
 
 use bags::{Demonstration, DemonstrationStep};
-use goal_oracle::GoalOracleParameters;
 use heightmap::{Heightmap, Workspace};
 use msgs::convert;
 use msgs::diagnostic_msgs::{DiagnosticArray, DiagnosticStatus};
@@ -119,13 +118,7 @@ async fn results_and_confirmations_walk_through_a_demonstration() {
         }],
         ..RosArguments::default()
     };
-    let oracle = context
-        .start(
-            "goal_oracle",
-            &arguments,
-            |node, parameters: GoalOracleParameters| goal_oracle::configure(node, parameters),
-        )
-        .unwrap();
+    let oracle = goal_oracle::start(&context, &arguments).unwrap();
 
     let first = next_goal(&mut goals, 1, 0, false).await;
     assert_eq!((first.step_count, first.problem.as_str()), (2, "placing"));
@@ -227,13 +220,7 @@ async fn by_image_distance_what_is_seen_after_a_motion_says_which_goal_is_next()
         ],
         ..RosArguments::default()
     };
-    let oracle = context
-        .start(
-            "goal_oracle",
-            &arguments,
-            |node, parameters: GoalOracleParameters| goal_oracle::configure(node, parameters),
-        )
-        .unwrap();
+    let oracle = goal_oracle::start(&context, &arguments).unwrap();
     let see = |height_m: f32, sec: i32| {
         let mut header = msgs::std_msgs::Header::default();
         header.stamp.sec = sec;
@@ -278,13 +265,7 @@ async fn by_image_distance_what_is_seen_after_a_motion_says_which_goal_is_next()
 #[tokio::test(flavor = "multi_thread")]
 async fn without_a_demonstration_the_node_refuses_to_start() {
     let context = Context::new(Network::unused().unwrap());
-    let oracle = context
-        .start(
-            "goal_oracle",
-            &RosArguments::default(),
-            |node, parameters: GoalOracleParameters| goal_oracle::configure(node, parameters),
-        )
-        .unwrap();
+    let oracle = goal_oracle::start(&context, &RosArguments::default()).unwrap();
     let error = oracle.await.unwrap().unwrap_err().to_string();
     assert!(error.contains("demonstration"), "{error}");
 }

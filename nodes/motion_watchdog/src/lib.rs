@@ -12,6 +12,8 @@ use msgs::ur_msgs::FollowJointTrajectoryUntil;
 use node_kit::{
     ActionClient, Active, CallOptions, Level, Node, Parameters, Qos, Range, Subscription, when,
 };
+#[cfg(not(test))]
+use node_kit::{Context, NodeLife, RosArguments};
 use serde::{Deserialize, Serialize};
 use tokio::time::sleep_until;
 use tracing::{error, warn};
@@ -55,6 +57,12 @@ impl Parameters for MotionWatchdogParameters {
 
 /// How often goals are cancelled again.
 const CANCEL_PERIOD: Duration = Duration::from_millis(100);
+
+/// Starts the node in a context. It is compiled here, once, and not anew in every program that has it; tests of this library have no use for it.
+#[cfg(not(test))]
+pub fn start(context: &Context, arguments: &RosArguments) -> anyhow::Result<NodeLife> {
+    context.start("motion_watchdog", arguments, configure)
+}
 
 /// Sets up the clients of the driver's actions.
 pub async fn configure(

@@ -25,6 +25,8 @@ use msgs::std_msgs::{self, Bool, Float64};
 use msgs::ur_dashboard_msgs::{RobotMode, SafetyMode};
 use msgs::ur_msgs::IOStates;
 use node_kit::{Active, Level, Node, Qos, Subscription};
+#[cfg(not(test))]
+use node_kit::{Context, NodeLife, RosArguments};
 use step_protocol::PRESENCE_PERIOD;
 use tokio::time::MissedTickBehavior;
 use tokio_util::sync::CancellationToken;
@@ -34,6 +36,12 @@ use crate::commands::Commands;
 use crate::convert::{motion_from_msg, report_from_msg, scores_from_msg};
 
 pub use parameters::OperatorConsoleParameters;
+
+/// Starts the node in a context. It is compiled here, once, and not anew in every program that has it; tests of this library have no use for it.
+#[cfg(not(test))]
+pub fn start(context: &Context, arguments: &RosArguments) -> anyhow::Result<NodeLife> {
+    context.start("operator_console", arguments, configure)
+}
 
 /// Reads certificate and key; what it returns serves the page while it is active.
 pub async fn configure(

@@ -3,5 +3,8 @@
 use std::process::ExitCode;
 
 fn main() -> ExitCode {
-    node_kit::main("operator_console", operator_console::configure)
+    node_kit::main::<operator_console::OperatorConsoleParameters>(
+        "operator_console",
+        operator_console::start,
+    )
 }

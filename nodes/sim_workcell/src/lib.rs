@@ -7,5 +7,7 @@
 mod node;
 mod parameters;
 
+#[cfg(not(test))]
+pub use node::start;
 pub use node::{HardwareNode, configure};
 pub use parameters::SimWorkcellParameters;

@@ -14,6 +14,8 @@ use cell_emulation::{
 use msgs::sctn_msgs::{ResetCell, ResetCellResponse};
 use multiravens::Problem;
 use node_kit::{Active, IdempotentServer, Node, ReplyCache};
+#[cfg(not(test))]
+use node_kit::{Context, NodeLife, RosArguments};
 use simulated_cell::{SimulatedCell, Wiring};
 use tokio::sync::oneshot;
 use tracing::warn;
@@ -22,6 +24,12 @@ use crate::parameters::SimWorkcellParameters;
 
 /// Commands that wait for the emulator's thread; more are refused.
 const WAITING_COMMANDS: usize = 64;
+
+/// Starts the node in a context. It is compiled here, once, and not anew in every program that has it; tests of this library have no use for it.
+#[cfg(not(test))]
+pub fn start(context: &Context, arguments: &RosArguments) -> anyhow::Result<NodeLife> {
+    context.start("sim_workcell", arguments, configure)
+}
 
 /// Begins the episode and returns the node that emulates the UR driver and the cameras.
 pub async fn configure(

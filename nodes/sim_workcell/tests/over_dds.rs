@@ -49,8 +49,7 @@ fn start(parameters: &[(&str, &str)]) -> (Context, Context, Node) {
         .unwrap();
     let sim = Context::new(network);
     let arguments = RosArguments::parse(line).unwrap().0;
-    sim.start("sim_workcell", &arguments, sim_workcell::configure)
-        .unwrap();
+    sim_workcell::start(&sim, &arguments).unwrap();
     (sim, own, node)
 }
 

@@ -7,5 +7,7 @@ mod cell;
 mod node;
 mod parameters;
 
+#[cfg(not(test))]
+pub use node::start;
 pub use node::{ExecutorNode, configure};
 pub use parameters::{JointLimits, Limits, SuctionExecutorParameters};

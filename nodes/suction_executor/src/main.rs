@@ -1,5 +1,8 @@
 //! The executable of the node.
 
 fn main() -> std::process::ExitCode {
-    node_kit::main("suction_executor", suction_executor::configure)
+    node_kit::main::<suction_executor::SuctionExecutorParameters>(
+        "suction_executor",
+        suction_executor::start,
+    )
 }

@@ -15,6 +15,8 @@ use node_kit::{
     ActionServer, Active, Node, Publisher, Qos, RequestId, RunningGoal, ServiceServer,
     Subscription, when,
 };
+#[cfg(not(test))]
+use node_kit::{Context, NodeLife, RosArguments};
 use rehearsal::{RehearsalRules, Rehearsals, Rehearsed};
 use step_protocol::{Executor, Recovery, StopCause};
 use tokio::task::JoinHandle;
@@ -32,6 +34,12 @@ const ANSWER_GRACE: Duration = Duration::from_secs(3);
 /// How long the result of a motion that was stopped at the end takes to be sent.
 const LAST_WORD: Duration = Duration::from_millis(100);
 const DIAGNOSTICS_PERIOD: Duration = Duration::from_millis(500);
+
+/// Starts the node in a context. It is compiled here, once, and not anew in every program that has it; tests of this library have no use for it.
+#[cfg(not(test))]
+pub fn start(context: &Context, arguments: &RosArguments) -> anyhow::Result<NodeLife> {
+    context.start("suction_executor", arguments, configure)
+}
 
 /// Loads the work cell and listens to the driver; returns the node that executes proposals.
 pub async fn configure(

@@ -125,22 +125,8 @@ impl Bench {
             ("problems_dir", problems_dir().display().to_string()),
             ("seed", SEED.to_string()),
         ];
-        bench
-            .sim
-            .start(
-                "sim_workcell",
-                &common(&scene, sim),
-                sim_workcell::configure,
-            )
-            .unwrap();
-        let life = bench
-            .executor
-            .start(
-                "suction_executor",
-                &common(&[], executor),
-                suction_executor::configure,
-            )
-            .unwrap();
+        sim_workcell::start(&bench.sim, &common(&scene, sim)).unwrap();
+        let life = suction_executor::start(&bench.executor, &common(&[], executor)).unwrap();
         bench.executor_life = Some(life);
         let graph = bench.node.graph();
         for topic in [

@@ -162,6 +162,9 @@ impl Network {
     }
 }
 
+/// A node that lives as a task; how it ended, once it has.
+pub type NodeLife = JoinHandle<anyhow::Result<()>>;
+
 /// What the nodes of a process have in common.
 ///
 /// Each node has a DDS participant of its own, in one process as in several: nodes of one participant
@@ -241,7 +244,7 @@ impl Context {
         default_name: &str,
         arguments: &RosArguments,
         configure: impl Fn(Node, P) -> F + Send + 'static,
-    ) -> anyhow::Result<JoinHandle<anyhow::Result<()>>>
+    ) -> anyhow::Result<NodeLife>
     where
         P: Parameters,
         A: Active,
@@ -322,16 +325,11 @@ fn protected(
 ///
 /// `--parameters` prints the parameters with their defaults. With the environment variable
 /// NODE_KIT_EXIT_WITH_PARENT=1 the node ends when the process that started it is gone.
-pub fn main<P, A, F>(
+pub fn main<P: Parameters>(
     default_name: &'static str,
-    configure: impl Fn(Node, P) -> F + Send + 'static,
-) -> ExitCode
-where
-    P: Parameters,
-    A: Active,
-    F: Future<Output = anyhow::Result<A>> + Send + 'static,
-{
-    match run_main(default_name, configure) {
+    start: impl FnOnce(&Context, &RosArguments) -> anyhow::Result<NodeLife>,
+) -> ExitCode {
+    match run_main::<P>(default_name, start) {
         Ok(()) => ExitCode::SUCCESS,
         Err(error) => {
             eprintln!("{default_name}: {error:#}");
@@ -340,15 +338,10 @@ where
     }
 }
 
-fn run_main<P, A, F>(
+fn run_main<P: Parameters>(
     default_name: &'static str,
-    configure: impl Fn(Node, P) -> F + Send + 'static,
-) -> anyhow::Result<()>
-where
-    P: Parameters,
-    A: Active,
-    F: Future<Output = anyhow::Result<A>> + Send + 'static,
-{
+    start: impl FnOnce(&Context, &RosArguments) -> anyhow::Result<NodeLife>,
+) -> anyhow::Result<()> {
     let (arguments, others) = RosArguments::parse(env::args().skip(1))?;
     match others.first().map(String::as_str) {
         None => {}
@@ -368,7 +361,7 @@ where
         .build()
         .context("tokio runtime")?;
     let result = runtime.block_on(async {
-        let ended = context.start(default_name, &arguments, configure)?;
+        let ended = start(&context, &arguments)?;
         let signalled = tokio::spawn({
             let context = context.clone();
             async move {

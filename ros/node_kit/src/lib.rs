@@ -1,7 +1,7 @@
 //! What ros2-client leaves to us: the one place where our nodes meet the middleware.
 //!
-//! A node is a library with `pub async fn configure(node: Node, parameters: P) -> anyhow::Result<A>`, where `A`
-//! is [`Active`], and a small binary that calls [`main`]; [`Context::start`] composes several in one process.
+//! A node is a library with an `async fn configure(node: Node, parameters: P) -> anyhow::Result<A>`, where `A` is [`Active`], a `pub fn start` that
+//! gives it to [`Context::start`], and a small binary that calls [`main`]. A process may start several.
 
 mod action;
 mod answerable;
@@ -36,7 +36,7 @@ mod when;
 pub use action::{ActionClient, ActionServer, GoalId, GoalStatus, NewGoal, RunningGoal, SentGoal};
 pub use arguments::{ArgumentError, ParameterSource, Remap, RosArguments};
 pub use clock::{Clock, ns_from_stamp, stamp_from_ns};
-pub use context::{Context, ContextError, Network, main, wait_for_end};
+pub use context::{Context, ContextError, Network, NodeLife, main, wait_for_end};
 pub use diagnostics::{Diagnostics, Level};
 pub use graph::Graph;
 pub use idempotent::{IdempotentServer, IdempotentService, NewRequest};

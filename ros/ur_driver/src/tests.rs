@@ -68,8 +68,7 @@ impl Bench {
             set(&format!("hardware.{name}"), value);
         }
         let arguments = RosArguments::parse(line).unwrap().0;
-        sim.start("sim_workcell", &arguments, sim_workcell::configure)
-            .unwrap();
+        sim_workcell::start(&sim, &arguments).unwrap();
         let parameters = node.service_client("sim_workcell/set_parameters").unwrap();
         let bench = Self {
             sim,

@@ -34,7 +34,9 @@ const RELIABLE: RawQos = RawQos {
 };
 
 fn main() -> ExitCode {
-    node_kit::main("interface_echo", configure)
+    node_kit::main::<NoParameters>("interface_echo", |context, arguments| {
+        context.start("interface_echo", arguments, configure)
+    })
 }
 
 async fn configure(_: Node, _: NoParameters) -> anyhow::Result<Echo> {

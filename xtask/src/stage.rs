@@ -11,18 +11,18 @@ use std::time::{Duration, Instant};
 /// One check.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
 pub enum Stage {
-    /// The slim libtorch and the Python environment of the end-to-end tests
+    /// The slim libtorch
     Setup,
     /// rustfmt would change nothing
     Fmt,
-    /// ruff finds no fault in the Python files and would format none of them
-    Python,
     /// Every dependency has a permissive licence, and dependencies between our crates are those of ARCHITECTURE.md
     Dependencies,
     /// clippy has no warning
     Clippy,
     /// The documentation builds without a warning
     Doc,
+    /// ruff finds no fault in the Python files and would format none of them
+    Python,
     /// Unit tests and documentation examples of every crate
     Unit,
     /// Real processes and rclpy of ROS 2 Jazzy: pytest in tests/
@@ -37,10 +37,7 @@ impl Stage {
     /// Runs the check. Everything is built in release, so that dependencies are compiled once.
     fn run(self, pytest_arguments: &[String]) -> Result<()> {
         match self {
-            Self::Setup => {
-                libtorch::set_up(&python::with_pip()?)?;
-                python::Environment::set_up().map(drop)
-            }
+            Self::Setup => libtorch::set_up(&python::with_pip()?),
             Self::Fmt => {
                 run(cargo().args(["fmt", "--check"]))?;
                 // Declared by a macro, which cargo fmt does not look into.
@@ -201,11 +198,40 @@ pub fn build_programs() -> Result<()> {
 
 /// Runs the given checks, or all of them when none is given, and prints how long each took.
 pub fn run_all(only: &[Stage], pytest_arguments: &[String]) -> Result<()> {
+    let is_chosen = |stage: &&Stage| only.is_empty() || only.contains(stage);
+    let chosen: Vec<Stage> = Stage::value_variants()
+        .iter()
+        .filter(is_chosen)
+        .copied()
+        .collect();
+    std::thread::scope(|scope| {
+        // Made meanwhile: much of it waits for downloads. The stage that needs one waits for it, and reports what fails.
+        scope.spawn(|| {
+            let makes = [
+                (
+                    Stage::EndToEnd,
+                    python::Environment::set_up as fn() -> Result<_>,
+                ),
+                (Stage::Kilted, python::Environment::set_up_kilted),
+            ];
+            for (stage, make) in makes {
+                if chosen.contains(&stage)
+                    && let Err(error) = make()
+                {
+                    println!(
+                        "python: {error:#}; tried again by the stage {}",
+                        stage.name()
+                    );
+                }
+            }
+        });
+        run_one_after_the_other(&chosen, pytest_arguments)
+    })
+}
+
+fn run_one_after_the_other(stages: &[Stage], pytest_arguments: &[String]) -> Result<()> {
     let mut times: Vec<(Stage, Duration)> = Vec::new();
-    for &stage in Stage::value_variants() {
-        if !only.is_empty() && !only.contains(&stage) {
-            continue;
-        }
+    for &stage in stages {
         println!("=== {} ===", stage.name());
         let start = Instant::now();
         stage

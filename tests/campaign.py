@@ -150,12 +150,13 @@ def run_cells(faults: list[Planned], seed: int, until_s: float = float("inf")) -
                         line.went_on = went_on = inject(bench, planned.fault, planned.moment_s)
                     except (TimeoutError, AssertionError) as error:
                         line.hung = went_on = str(error) or type(error).__name__
+                        print_logs(bench)
                     bench.catch_up()
                     found = bench.monitor.violations[known:]
                     line.violations = [(violation.kind.value, violation.text) for violation in found][:5]
                     if found:
                         line.history = found[0].history
-                        print(f"the executor's log:\n{bench.executor.log()[-LOG_CHARACTERS:]}", file=sys.stderr, flush=True)
+                        print_logs(bench)
                     print(f"{json.dumps(dataclasses.asdict(line))}", file=sys.stderr, flush=True)
                     yield line
         except TimeoutError as error:
@@ -166,6 +167,14 @@ def run_cells(faults: list[Planned], seed: int, until_s: float = float("inf")) -
             line.hung = f"no cell that works: {went_on}"
             print(f"{json.dumps(dataclasses.asdict(line))}", file=sys.stderr, flush=True)
             yield line
+
+
+def print_logs(bench: Bench) -> None:
+    """The ends of the nodes' logs, on standard error."""
+    nodes = {"suction_executor": bench.executor, "goal_oracle": bench.oracle, **bench.graph}
+    for name, node in nodes.items():
+        if node:
+            print(f"{name}'s log:\n{node.log()[-LOG_CHARACTERS:]}", file=sys.stderr, flush=True)
 
 
 def injected(planned: Planned, seed: int) -> Injected:

@@ -65,8 +65,6 @@ pub(crate) enum Mutation {
     RefusedIsNotRenewed,
     /// A page does not ask again where a decision was not answered.
     UnansweredIsForgotten,
-    /// A page shows a run as stopped after it was continued.
-    ContinuedStaysStopped,
     /// A proposal for another goal hides that for the present one from the page.
     OtherGoalHidesProposal,
     /// A motion that the goal tracker does not know hides what is proposed after it from the page.
@@ -78,7 +76,7 @@ pub(crate) enum Mutation {
 impl Mutation {
     /// All of them.
     #[cfg(test)]
-    pub(crate) const ALL: [Self; 35] = [
+    pub(crate) const ALL: [Self; 34] = [
         Self::ApprovalMovesTwice,
         Self::SupersededStaysPending,
         Self::WaitingSurvivesStop,
@@ -110,7 +108,6 @@ impl Mutation {
         Self::SilenceForgetsMotion,
         Self::RefusedIsNotRenewed,
         Self::UnansweredIsForgotten,
-        Self::ContinuedStaysStopped,
         Self::OtherGoalHidesProposal,
         Self::UnknownMotionHidesProposal,
         Self::StaleMotionHidesOthers,

@@ -287,9 +287,10 @@ impl Operator {
         self.broken_off.take_if(is_confirmed);
     }
 
-    /// The goal tracker goes on with the present goal, as it was asked to: where it had not heard of a stop, no other goal comes.
+    /// The goal tracker goes on with the present goal, as it was asked to: where it had heard neither of a stop nor of a proposal, no other
+    /// goal comes.
     pub fn on_continued(&mut self) {
-        self.stopped &= planted(Mutation::ContinuedStaysStopped);
+        self.stopped = false;
     }
 
     /// A new proposal supersedes the one before. While a motion for the same goal waits for its confirmation nothing more is

@@ -355,8 +355,10 @@ impl GoalTracker {
     fn restart_at(&mut self, index: usize) -> Change {
         let was_stopped = std::mem::take(&mut self.stopped);
         let stamp = self.stamp.max(self.moved_until);
-        // While the run was stopped proposals were made from what was seen after the motion; they must not be taken for new ones.
-        let attempt = match stamp == self.stamp || was_stopped {
+        // Somebody may have proposed for the present step from what was seen after the motion, while the run was stopped too: that must
+        // not be taken for new.
+        let is_used = was_stopped || (index == self.reached && self.current.is_some());
+        let attempt = match stamp == self.stamp || is_used {
             true => self.next_attempt(index),
             false => 0,
         };

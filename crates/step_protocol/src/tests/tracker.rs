@@ -399,7 +399,8 @@ fn the_present_step_is_published_again_where_something_was_proposed_for_it() {
     assert_eq!(tracker.set_step(1), Ok(Change::None));
     tracker.on_proposal(&proposal(8, 1, 1));
     tracker.on_result(&result(8, StepOutcome::GraspFailed, 5));
-    assert_eq!(goal(tracker.set_step(1).unwrap()), (1, 0, 5, false));
+    // A proposal from what is seen since may be on its way.
+    assert_eq!(goal(tracker.set_step(1).unwrap()), (1, 2, 5, false));
 }
 
 #[test]

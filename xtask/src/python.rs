@@ -290,9 +290,6 @@ impl Environment {
                     &prefix,
                     "-DCMAKE_INSTALL_RPATH=$ORIGIN",
                     "-DCMAKE_BUILD_TYPE=Release",
-                    // What the generators write is long, and copies fields: no faster with more.
-                    "-DCMAKE_C_FLAGS_RELEASE=-O1 -DNDEBUG",
-                    "-DCMAKE_CXX_FLAGS_RELEASE=-O1 -DNDEBUG",
                 ])
                 .args(["-DBUILD_TESTING=OFF", "-DPython3_FIND_VIRTUALENV=ONLY"]),
         )?;
